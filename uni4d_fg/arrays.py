@@ -1,0 +1,24 @@
+"""Array types and the namespace switch that lets one residual serve NumPy and torch."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import array_api_compat
+import numpy as np
+import numpy.typing as npt
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+Float32Array: TypeAlias = npt.NDArray[np.float32]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+Int32Array: TypeAlias = npt.NDArray[np.int32]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+ImageArray: TypeAlias = npt.NDArray[np.uint8]
+
+# Residual functions accept either numpy.ndarray or torch.Tensor; neither is a subtype of the other.
+Array: TypeAlias = Any
+
+
+def namespace(array: Array) -> Any:
+    """Return the array-API namespace (NumPy or torch) that ``array`` belongs to."""
+    return array_api_compat.array_namespace(array)

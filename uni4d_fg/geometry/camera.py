@@ -1,0 +1,93 @@
+r"""The pinhole camera: projection, lifting, and a cheirality policy that pushes.
+
+Pixels ``uv`` have x to the right, y down and centres at integers. Camera axes are OpenCV's (x right,
+y down, z forward). ``intrinsics`` is ``(fx, fy, cx, cy)`` in pixels; there is no skew or distortion.
+
+A plain projection has no useful gradient behind the camera: the point jumps through infinity. Here the
+inverse depth ``1/z`` is continued below ``near`` by its tangent line,
+
+    g(z) = 1/z                     for z >= near
+    g(z) = (2 near - z) / near^2   for z <  near
+
+which is continuous with its first derivative and grows as the point moves back, so that the reprojection
+error of a point behind the camera is large and its gradient pushes the point to the front.
+"""
+
+from __future__ import annotations
+
+from uni4d_fg.arrays import Array, namespace
+
+NEAR_PLANE = 0.02
+"""Depth in metres below which the inverse depth is continued linearly."""
+
+
+def inverse_depth(z: Array, near: float = NEAR_PLANE) -> Array:
+    """Return g(z) of the module docstring. Args: ``z`` of any shape, metres. Returns the same shape, 1/m."""
+    xp = namespace(z)
+    safe = xp.where(z >= near, z, near)
+    return xp.where(z >= near, 1.0 / safe, (2.0 * near - z) / near**2)
+
+
+def inverse_depth_slope(z: Array, near: float = NEAR_PLANE) -> Array:
+    """Return dg/dz, the derivative of :func:`inverse_depth`; same shape as ``z``, 1/m^2."""
+    xp = namespace(z)
+    safe = xp.where(z >= near, z, near)
+    return -1.0 / (safe * safe)
+
+
+def project(intrinsics: Array, point_cam: Array, near: float = NEAR_PLANE) -> Array:
+    """Project camera-frame points to pixels.
+
+    Args:
+        intrinsics: (..., 4) fx, fy, cx, cy in px, broadcast against the points.
+        point_cam: (..., 3) points in the camera frame, metres.
+        near: Depth below which the inverse depth is continued linearly.
+
+    Returns:
+        (..., 2) pixel coordinates.
+    """
+    xp = namespace(point_cam)
+    g = inverse_depth(point_cam[..., 2], near)
+    u = intrinsics[..., 0] * point_cam[..., 0] * g + intrinsics[..., 2]
+    v = intrinsics[..., 1] * point_cam[..., 1] * g + intrinsics[..., 3]
+    return xp.stack((u, v), axis=-1)
+
+
+def unproject(intrinsics: Array, uv: Array, depth: Array) -> Array:
+    """Lift pixels with z-depth to the camera frame.
+
+    Args:
+        intrinsics: (..., 4) fx, fy, cx, cy in px.
+        uv: (..., 2) pixels.
+        depth: (...) z-depth in metres.
+
+    Returns:
+        (..., 3) points in the camera frame, metres.
+    """
+    xp = namespace(uv)
+    x = (uv[..., 0] - intrinsics[..., 2]) / intrinsics[..., 0] * depth
+    y = (uv[..., 1] - intrinsics[..., 3]) / intrinsics[..., 1] * depth
+    return xp.stack((x, y, depth + 0.0 * x), axis=-1)
+
+
+def world_to_camera(world_T_cam: Array, point_world: Array) -> Array:
+    """Express world points in the camera frame: ``R^T (p - c)``.
+
+    Args:
+        world_T_cam: (..., 4, 4) camera poses.
+        point_world: (..., 3) world points, metres.
+
+    Returns:
+        (..., 3) camera-frame points, metres.
+    """
+    xp = namespace(point_world)
+    d = point_world - world_T_cam[..., :3, 3]
+    rotation = world_T_cam[..., :3, :3]
+    return xp.sum(rotation * d[..., :, None], axis=-2)
+
+
+def camera_to_world(world_T_cam: Array, point_cam: Array) -> Array:
+    """Express camera-frame points in the world: ``R x + c``. Shapes as in :func:`world_to_camera`."""
+    xp = namespace(point_cam)
+    rotation = world_T_cam[..., :3, :3]
+    return xp.sum(rotation * point_cam[..., None, :], axis=-1) + world_T_cam[..., :3, 3]

@@ -1,0 +1,1 @@
+"""What comes out: the reconstruction, its files and its pictures."""

@@ -1,0 +1,1 @@
+"""What comes in: frames, depth, masks, tracks, calibration and ground truth of one video."""

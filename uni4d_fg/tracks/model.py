@@ -1,0 +1,91 @@
+"""Point tracks over a video and their labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import BoolArray, Float32Array, Int32Array
+from uni4d_fg.errors import InputError
+
+
+class TrackLabel(IntEnum):
+    """What a track belongs to."""
+
+    STATIC = 0
+    """Static in every frame in which it is surely seen, and long enough to carry a camera."""
+    DYNAMIC = 1
+    """On one moving instance in every frame in which it is surely seen."""
+    SHORT_STATIC = 2
+    """Static but seen in too few frames for camera initialisation; used after bundle adjustment."""
+    REJECTED = 3
+    """Mixed, never surely seen, or switching between instances."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """K point tracks over T frames.
+
+    Raises:
+        InputError: If shapes or dtypes disagree, or a visible observation is not finite.
+    """
+
+    uv: Float32Array
+    """(K, T, 2) pixels, NaN where not visible."""
+    visible: BoolArray
+    """(K, T)."""
+    query_frame: Int32Array
+    """(K,) frame in which the track was started, in [0, T)."""
+    confidence: Float32Array | None = None
+    """(K, T) in [0, 1], when the tracker gives one."""
+
+    def __post_init__(self) -> None:
+        k, t = self.visible.shape if self.visible.ndim == 2 else (-1, -1)
+        if self.uv.shape != (k, t, 2) or self.query_frame.shape != (k,):
+            raise InputError(
+                f"tracks: uv {self.uv.shape}, visible {self.visible.shape} and query_frame "
+                f"{self.query_frame.shape} must be (K, T, 2), (K, T) and (K,)"
+            )
+        if self.visible.dtype != np.bool_:
+            raise InputError(f"tracks: visible must be bool, got {self.visible.dtype}")
+        if self.confidence is not None and self.confidence.shape != (k, t):
+            raise InputError(f"tracks: confidence {self.confidence.shape} must be ({k}, {t})")
+        if k and not bool(np.isfinite(self.uv[self.visible]).all()):
+            raise InputError("tracks: a visible observation is NaN or infinite; mark it not visible instead")
+
+    @property
+    def num_tracks(self) -> int:
+        """Number of tracks K."""
+        return int(self.visible.shape[0])
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames T."""
+        return int(self.visible.shape[1])
+
+    def select(self, keep: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Tracks:
+        """Return the tracks picked by a boolean mask or by indices."""
+        confidence = None if self.confidence is None else self.confidence[keep]
+        return Tracks(self.uv[keep], self.visible[keep], self.query_frame[keep], confidence)
+
+
+@dataclass(frozen=True)
+class LabelledTracks:
+    """Tracks with what each belongs to and which observations to trust."""
+
+    tracks: Tracks
+    label: Int32Array
+    """(K,) values of :class:`TrackLabel`."""
+    instance: Int32Array
+    """(K,) mask id of the moving instance; 0 for every track that is not DYNAMIC."""
+    weight: Float32Array
+    """(K, T) in [0, 1]: 0 where not visible or dropped, below 1 inside the uncertain band of a mask."""
+    depth: Float32Array
+    """(K, T) metres: the depth cue at each observation (bilinear), NaN where missing or not visible."""
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of tracks per label name."""
+        return {label.name.lower(): int((self.label == label).sum()) for label in TrackLabel}
