@@ -1,0 +1,5 @@
+"""Typed configuration: pydantic models, YAML presets, command-line overrides."""
+
+from uni4d_fg.config.models import Config
+
+__all__ = ["Config"]

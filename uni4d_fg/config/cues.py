@@ -1,0 +1,56 @@
+"""Configuration of what happens before the first stage: tracks, labels, use of given poses."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from uni4d_fg.config.base import Section, setting
+
+
+class TrackingConfig(Section):
+    """Built-in tracker (pyramidal Lucas-Kanade on a grid), used when a sequence brings no tracks."""
+
+    grid_columns: int = setting(50, "Query points per row of the grid.", ge=2, le=400)
+    grid_rows: int = setting(50, "Query points per column of the grid.", ge=2, le=400)
+    query_interval: int = setting(10, "A new grid is started every this many frames.", ge=1)
+    margin_px: float = setting(8.0, "Distance of the outermost query points from the image border, px.", ge=0)
+    window_px: int = setting(21, "Side of the Lucas-Kanade window, px (odd).", ge=5, le=101)
+    pyramid_levels: int = setting(3, "Pyramid levels above the full image.", ge=0, le=8)
+    max_iterations: int = setting(30, "Lucas-Kanade iterations per level.", ge=1)
+    forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0)
+    max_patch_error: float = setting(12.0, "Largest mean absolute grey-level difference of the window.", gt=0)
+    min_texture: float = setting(1e-4, "Smallest eigenvalue of the window's gradient matrix (OpenCV scale).", ge=0)
+    border_px: float = setting(1.0, "A point closer than this to the image border is lost, px.", ge=0)
+    min_observations: int = setting(3, "Tracks seen in fewer frames are not kept.", ge=1)
+
+
+class LabelConfig(Section):
+    """Static / dynamic / rejected labels from the masks, with an uncertain band around object borders."""
+
+    band_static_px: int = setting(5, "Width of the band on the static side of a mask border, px.", ge=0, le=100)
+    band_dynamic_px: int = setting(3, "Width of the band on the object's side of a mask border, px.", ge=0, le=100)
+    band_weight: float = setting(
+        0.0, "Weight of a kept track's observations inside the band; 0 drops them.", ge=0, le=1
+    )
+    min_static_fraction: float = setting(
+        0.1, "A static track must be surely seen in this fraction of the frames to carry a camera.", ge=0, le=1
+    )
+    min_static_frames: int = setting(5, "... and never in more than this many frames need it be.", ge=1)
+    max_off_label_fraction: float = setting(
+        0.0, "Share of a track's sure observations that may disagree with its label (they are dropped).",
+        ge=0, lt=0.5,
+    )  # fmt: skip
+
+
+class InputConfig(Section):
+    """What of the sequence is taken as known."""
+
+    intrinsics: Literal["free", "fixed"] = setting(
+        "free", "'free': the sequence's intrinsics are a starting value; 'fixed': they are kept."
+    )
+    poses: Literal["estimate", "initial", "fixed"] = setting(
+        "estimate",
+        "'estimate': ignore given poses; 'initial': start stage 2 from them; 'fixed': keep them.",
+    )
+    min_depth_m: float = setting(0.05, "Depth below this is treated as missing, m.", ge=0)
+    max_depth_m: float = setting(80.0, "Depth above this is treated as missing, m.", gt=0)

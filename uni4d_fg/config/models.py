@@ -1,0 +1,40 @@
+"""The whole configuration of a run."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from uni4d_fg.config.base import Section, setting
+from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
+
+
+class OutputConfig(Section):
+    """What a run writes besides the reconstruction and its summary."""
+
+    clouds: bool = setting(True, "Write the static and per-frame dynamic PLY files.")
+    pictures: bool = setting(True, "Write the trajectory plot, the depth strip and the rendered views.")
+
+
+class Config(Section):
+    """Everything a run depends on besides its input; saved beside every result."""
+
+    normalization: Literal["mean", "sum"] = setting(
+        "mean",
+        "Weights of the exact energy and of 'paper' solves. 'mean': per-frame means, then the mean over frames "
+        "(the reference program); 'sum': plain sums (the paper's text).",
+    )
+    energy: Literal["map", "unsquared"] = setting(
+        "map",
+        "'map': squared, robust terms with calibrated sigmas; 'unsquared': the paper's norms and weights, "
+        "smoothed and annealed.",
+    )
+    seed: int = setting(0, "Seed of every random choice.", ge=0)
+    input: InputConfig = setting(InputConfig(), "Use of what the sequence brings.")
+    tracking: TrackingConfig = setting(TrackingConfig(), "Built-in tracker.")
+    labels: LabelConfig = setting(LabelConfig(), "Track labels.")
+    camera_init: CameraInitConfig = setting(CameraInitConfig(), "Stage 1.")
+    bundle_adjustment: BundleAdjustmentConfig = setting(BundleAdjustmentConfig(), "Stage 2.")
+    nonrigid: NonRigidConfig = setting(NonRigidConfig(), "Stage 3.")
+    fusion: FusionConfig = setting(FusionConfig(), "Fusion.")
+    output: OutputConfig = setting(OutputConfig(), "Output.")

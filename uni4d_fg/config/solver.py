@@ -1,0 +1,33 @@
+"""Configuration of the Levenberg-Marquardt driver and of robust kernels."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from uni4d_fg.config.base import Section, setting
+
+
+class SolverConfig(Section):
+    """Options of one Levenberg-Marquardt solve."""
+
+    max_iterations: int = setting(50, "Largest number of linearisations.", ge=1)
+    relative_decrease: float = setting(1e-5, "Stop when an accepted step lowers the energy by less than this part.", gt=0, lt=1)
+    gradient_tolerance: float = setting(1e-10, "Stop when the scaled gradient's largest entry is below this.", ge=0)
+    step_tolerance: float = setting(1e-9, "Stop when the step's norm is below this.", ge=0)
+    initial_damping: float = setting(1e-4, "First damping, relative to the Hessian's diagonal.", gt=0)
+    max_damping: float = setting(1e10, "Damping above which the solve stops with 'damping limit'.", gt=0)
+    min_diagonal: float = setting(1e-6, "Floor of the Hessian's diagonal used for damping.", gt=0)
+    max_diagonal: float = setting(1e32, "Ceiling of the Hessian's diagonal used for damping.", gt=0)
+    cg_tolerance: float = setting(0.03, "Relative residual at which an inexact inner solve stops.", gt=0, lt=1)
+    cg_max_iterations: int = setting(200, "Largest number of inner conjugate-gradient steps.", ge=1)
+
+
+class KernelConfig(Section):
+    """A robust kernel on the whitened residual norm s."""
+
+    kind: Literal["quadratic", "huber", "pseudo_huber", "cauchy", "norm"] = setting(
+        "huber",
+        "rho(s): 'quadratic' s^2/2; 'huber', 'pseudo_huber', 'cauchy' with threshold; "
+        "'norm' sqrt(s^2 + threshold^2), the smooth form of the unsquared norm.",
+    )
+    threshold: float = setting(1.345, "Threshold in whitened units (for 'norm': smoothing in the residual's unit).", gt=0)
