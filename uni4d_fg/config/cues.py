@@ -33,7 +33,10 @@ class LabelConfig(Section):
         0.0, "Weight of a kept track's observations inside the band; 0 drops them.", ge=0, le=1
     )
     min_static_fraction: float = setting(
-        0.1, "A static track must be surely seen in this fraction of the frames to carry a camera.", ge=0, le=1
+        0.1,
+        "A static track must be surely seen in this fraction of the frames to carry a camera.",
+        ge=0,
+        le=1,
     )
     min_static_frames: int = setting(5, "... and never in more than this many frames need it be.", ge=1)
     max_off_label_fraction: float = setting(

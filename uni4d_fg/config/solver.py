@@ -11,7 +11,9 @@ class SolverConfig(Section):
     """Options of one Levenberg-Marquardt solve."""
 
     max_iterations: int = setting(50, "Largest number of linearisations.", ge=1)
-    relative_decrease: float = setting(1e-5, "Stop when an accepted step lowers the energy by less than this part.", gt=0, lt=1)
+    relative_decrease: float = setting(
+        1e-5, "Stop when an accepted step lowers the energy by less than this part.", gt=0, lt=1
+    )
     gradient_tolerance: float = setting(1e-10, "Stop when the scaled gradient's largest entry is below this.", ge=0)
     step_tolerance: float = setting(1e-9, "Stop when the step's norm is below this.", ge=0)
     initial_damping: float = setting(1e-4, "First damping, relative to the Hessian's diagonal.", gt=0)
@@ -30,4 +32,6 @@ class KernelConfig(Section):
         "rho(s): 'quadratic' s^2/2; 'huber', 'pseudo_huber', 'cauchy' with threshold; "
         "'norm' sqrt(s^2 + threshold^2), the smooth form of the unsquared norm.",
     )
-    threshold: float = setting(1.345, "Threshold in whitened units (for 'norm': smoothing in the residual's unit).", gt=0)
+    threshold: float = setting(
+        1.345, "Threshold in whitened units (for 'norm': smoothing in the residual's unit).", gt=0
+    )

@@ -13,7 +13,9 @@ class CameraMotionConfig(Section):
 
     weight: float = setting(1.0, "Weight of each of E_rot and E_trans; 0 switches the term off.", ge=0)
     rotation_floor_rad: float = setting(
-        2e-3, "Guard added to the denominator of E_rot, rad: a camera at rest has zero, not infinite, energy.", gt=0
+        2e-3,
+        "Guard added to the denominator of E_rot, rad: a camera at rest has zero, not infinite, energy.",
+        gt=0,
     )
     translation_floor_m: float = setting(1e-3, "Guard added to the denominator of E_trans, m.", gt=0)
 
@@ -26,8 +28,12 @@ class CameraInitConfig(Section):
         400, "Tracks used per frame pair, spread evenly over those available; 0 uses all.", ge=0
     )
     min_tracks_per_frame: int = setting(12, "Frames with fewer usable tracks are bridged by constant velocity.", ge=3)
-    free_intrinsics: bool = setting(True, "Let the focal lengths move in the window solves (if input.intrinsics is free).")
-    focal_prior_fraction: float = setting(0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0)
+    free_intrinsics: bool = setting(
+        True, "Let the focal lengths move in the window solves (if input.intrinsics is free)."
+    )
+    focal_prior_fraction: float = setting(
+        0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0
+    )
     reprojection_sigma_px: float = setting(1.0, "Standard deviation of a depth reprojection residual, px.", gt=0)
     kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of depth reprojection.")
     camera_motion: CameraMotionConfig = setting(CameraMotionConfig(weight=0.0), "E_cam within the window.")
@@ -38,25 +44,43 @@ class BundleAdjustmentConfig(Section):
     """Stage 2: poses, intrinsics, depth scales and landmarks together."""
 
     free_principal_point: bool = setting(False, "Free cx, cy too (if input.intrinsics is free).")
-    focal_prior_fraction: float = setting(0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0)
+    focal_prior_fraction: float = setting(
+        0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0
+    )
     reprojection_sigma_px: float = setting(1.0, "Starting standard deviation of static reprojection, px.", gt=0)
     depth_sigma: float = setting(0.03, "Starting standard deviation of log depth.", gt=0)
-    measure_noise: bool = setting(True, "Replace both by the static scene's own (median absolute deviation) after a first solve.")
+    measure_noise: bool = setting(
+        True, "Replace both by the static scene's own (median absolute deviation) after a first solve."
+    )
     reprojection_sigma_factor: float = setting(1.0, "Measured reprojection sigma is multiplied by this.", gt=0)
     depth_sigma_factor: float = setting(1.0, "Measured depth sigma is multiplied by this.", gt=0)
     min_reprojection_sigma_px: float = setting(0.1, "Floor of the measured reprojection sigma, px.", gt=0)
     min_depth_sigma: float = setting(0.002, "Floor of the measured depth sigma.", gt=0)
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of E_BA.")
     depth_kernel: KernelConfig = setting(KernelConfig(kind="cauchy", threshold=2.0), "Kernel of the depth prior.")
-    depth_prior: bool = setting(True, "Use the depth prior with a log-scale per frame; without it one distance anchors the scale.")
+    depth_prior: bool = setting(
+        True, "Use the depth prior with a log-scale per frame; without it one distance anchors the scale."
+    )
     depth_scale_prior_sigma: float = setting(0.05, "Standard deviation of a frame's log-scale about zero.", gt=0)
     camera_motion: CameraMotionConfig = setting(CameraMotionConfig(weight=0.1), "E_cam.")
     max_reprojection_px: float = setting(8.0, "Observations above this after the first solve are dropped, px.", gt=0)
     min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2)
-    max_depth_ratio: float = setting(1.5, "Landmarks whose depth disagrees with the cue's median by more than this factor are dropped.", gt=1)
-    outlier_quantile: float = setting(0.98, "Landmarks whose mean squared neighbour distance lies above this quantile (times outlier_factor) are dropped.", gt=0, le=1)
+    max_depth_ratio: float = setting(
+        1.5,
+        "Landmarks whose depth disagrees with the cue's median by more than this factor are dropped.",
+        gt=1,
+    )
+    outlier_quantile: float = setting(
+        0.98,
+        "Landmarks whose mean squared neighbour distance lies above this quantile (times outlier_factor) are dropped.",
+        gt=0,
+        le=1,
+    )
     outlier_factor: float = setting(3.0, "Factor on that quantile.", gt=0)
-    relift: bool = setting(False, "After the solve, replace landmarks by the mean lift of the depth cue (the reference's choice).")
+    relift: bool = setting(
+        False,
+        "After the solve, replace landmarks by the mean lift of the depth cue (the reference's choice).",
+    )
     solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-4), "Solver.")
 
 
@@ -64,23 +88,36 @@ class NonRigidConfig(Section):
     """Stage 3: one point per dynamic track and frame, cameras frozen."""
 
     neighbours: int = setting(6, "ARAP neighbours per track, within its own instance.", ge=0)
-    max_neighbour_ratio: float = setting(6.0, "Neighbours farther than this many times the instance's median neighbour distance are not linked.", gt=0)
+    max_neighbour_ratio: float = setting(
+        6.0,
+        "Neighbours farther than this many times the instance's median neighbour distance are not linked.",
+        gt=0,
+    )
     min_observations: int = setting(3, "Dynamic tracks seen in fewer frames are dropped.", ge=1)
-    bridge_gaps: bool = setting(True, "Estimate a track's points in the frames between its first and last observation in which it is hidden.")
+    bridge_gaps: bool = setting(
+        True,
+        "Estimate a track's points in the frames between its first and last observation in which it is hidden.",
+    )
     reprojection: bool = setting(True, "Use E_NR.")
     depth_prior: bool = setting(True, "Use the depth prior.")
-    reprojection_sigma_px: float | None = setting(None, "Sigma of E_NR, px; null takes the one measured on the static scene.")
+    reprojection_sigma_px: float | None = setting(
+        None, "Sigma of E_NR, px; null takes the one measured on the static scene."
+    )
     depth_sigma: float | None = setting(None, "Sigma of log depth; null takes the one measured on the static scene.")
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of E_NR.")
     depth_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of the depth prior.")
     smoothness_order: Literal[1, 2] = setting(2, "1: first difference (velocity); 2: second difference (acceleration).")
-    smoothness_sigma_m: float = setting(0.004, "Sigma of the difference, m. 'default': a point's acceleration per frame^2.", gt=0)
+    smoothness_sigma_m: float = setting(
+        0.004, "Sigma of the difference, m. 'default': a point's acceleration per frame^2.", gt=0
+    )
     smoothness_weight: float = setting(1.0, "Weight of temporal smoothness; 0 switches the term off.", ge=0)
     smoothness_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
     arap_sigma_m: float = setting(0.01, "Sigma of the change of a neighbour distance, m.", gt=0)
     arap_weight: float = setting(1.0, "Weight of ARAP; 0 switches the term off.", ge=0)
     arap_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
-    outlier_quantile: float = setting(0.98, "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.", gt=0, le=1)
+    outlier_quantile: float = setting(
+        0.98, "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.", gt=0, le=1
+    )
     outlier_margin: float = setting(1.0, "Added to that quantile.", ge=0)
     solver: SolverConfig = setting(SolverConfig(max_iterations=20, relative_decrease=1e-4), "Solver.")
 
@@ -89,11 +126,19 @@ class FusionConfig(Section):
     """Dense depth that agrees with the sparse points, and the 4D cloud."""
 
     neighbours: int = setting(3, "Control points per pixel (nearest in 3D, of the pixel's own instance).", ge=1)
-    smoothing: int = setting(16, "Each control point's scale is the median over this many nearest control points; 1 keeps it raw.", ge=1)
+    smoothing: int = setting(
+        16,
+        "Each control point's scale is the median over this many nearest control points; 1 keeps it raw.",
+        ge=1,
+    )
     min_control_points: int = setting(8, "With fewer, the instance's pixels get the frame's scale alone.", ge=1)
-    max_log_scale: float = setting(0.5, "Control scales farther than this from the frame's log-scale are discarded.", gt=0)
+    max_log_scale: float = setting(
+        0.5, "Control scales farther than this from the frame's log-scale are discarded.", gt=0
+    )
     stride: int = setting(4, "Scales are interpolated on a grid of this spacing and bilinearly in between, px.", ge=1)
-    edge_relative_gradient: float = setting(0.05, "Pixels whose depth changes by more than this part per pixel are left out of the clouds.", gt=0)
+    edge_relative_gradient: float = setting(
+        0.05, "Pixels whose depth changes by more than this part per pixel are left out of the clouds.", gt=0
+    )
     static_stride: int = setting(4, "The static cloud takes every this many pixels in x and y.", ge=1)
     static_frame_stride: int = setting(5, "... of every this many frames.", ge=1)
     static_voxel_m: float = setting(0.01, "Voxel size of the static cloud, m; 0 keeps every point.", ge=0)

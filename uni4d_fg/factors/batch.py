@@ -1,0 +1,154 @@
+"""Many factors of one family at once: which variables each row reads, its data, noise and kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.errors import SolverError
+from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.kernels import Kernel
+from uni4d_fg.graph.state import TANGENT_DIM, State
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One argument of a factor: the group it reads and the row of each of the N factors."""
+
+    group: str
+    rows: IntArray  # (N,)
+
+
+@dataclass(frozen=True)
+class FactorBatch:
+    """N factors of one family. The energy is ``sum_n weight_n rho(|r_n / sigma_n|)``.
+
+    Raises:
+        SolverError: On construction, if an array's length differs from N, naming the term and the array.
+    """
+
+    family: FactorFamily
+    slots: tuple[Slot, ...]
+    data: Mapping[str, FloatArray]
+    sigma: FloatArray
+    """Standard deviation per row (N,) or per row and component (N, d), in the residual's unit."""
+    weight: FloatArray
+    """(N,) non-negative factor on the row's energy."""
+    kernel: Kernel
+    term: str = ""
+    """Name in summaries; the family's name when empty."""
+
+    def __post_init__(self) -> None:
+        n = len(self.slots[0].rows)
+        if len(self.slots) != len(self.family.variables):
+            raise SolverError(f"{self.name}: {len(self.slots)} slots for {len(self.family.variables)} variables")
+        lengths = {f"slot {s.group}": len(s.rows) for s in self.slots}
+        lengths |= {f"data {name}": len(array) for name, array in self.data.items()}
+        lengths |= {"sigma": len(self.sigma), "weight": len(self.weight)}
+        wrong = {name: length for name, length in lengths.items() if length != n}
+        if wrong:
+            raise SolverError(f"{self.name}: every array needs {n} rows, got {wrong}")
+        if set(self.data) != set(self.family.data):
+            raise SolverError(f"{self.name}: needs data {self.family.data}, got {tuple(self.data)}")
+
+    @classmethod
+    def create(
+        cls,
+        family: FactorFamily,
+        slots: tuple[Slot, ...],
+        data: Mapping[str, FloatArray] | None = None,
+        *,
+        sigma: FloatArray | float = 1.0,
+        weight: FloatArray | float = 1.0,
+        kernel: Kernel | None = None,
+        term: str = "",
+    ) -> FactorBatch:
+        """Build a batch, broadcasting scalar ``sigma`` and ``weight`` to all rows."""
+        n = len(slots[0].rows)
+        sigma_array = np.broadcast_to(np.asarray(sigma, dtype=np.float64), np.shape(sigma) or (n,))
+        weight_array = np.broadcast_to(np.asarray(weight, dtype=np.float64), (n,))
+        return cls(family, slots, data or {}, sigma_array, weight_array, kernel or Kernel(), term)
+
+    def __len__(self) -> int:
+        return len(self.slots[0].rows)
+
+    @property
+    def name(self) -> str:
+        """Name of the term in summaries and messages."""
+        return self.term or self.family.name
+
+    def take(self, rows: IntArray) -> FactorBatch:
+        """Return the batch with the given rows, in the given order."""
+        return replace(
+            self,
+            slots=tuple(Slot(s.group, s.rows[rows]) for s in self.slots),
+            data={name: array[rows] for name, array in self.data.items()},
+            sigma=self.sigma[rows],
+            weight=self.weight[rows],
+        )
+
+    def gather(self, state: State) -> list[FloatArray]:
+        """Return the variables of every row, one array per slot."""
+        return [state[s.group][s.rows] for s in self.slots]
+
+    def residual(self, state: State) -> FloatArray:
+        """Return the raw residuals (N, d)."""
+        result: FloatArray = self.family.residual(*self.gather(state), **self.data)
+        return result
+
+    def _inverse_sigma(self) -> FloatArray:
+        return 1.0 / (self.sigma[:, None] if self.sigma.ndim == 1 else self.sigma)
+
+    def squared_norm(self, state: State) -> FloatArray:
+        """Return the whitened squared norm of every row, (N,)."""
+        whitened = self.residual(state) * self._inverse_sigma()
+        result: FloatArray = np.einsum("nd,nd->n", whitened, whitened)
+        return result
+
+    def energy(self, state: State) -> float:
+        """Return ``sum_n weight_n rho(|r_n / sigma_n|)``."""
+        if len(self) == 0:
+            return 0.0
+        return float(np.dot(self.weight, self.kernel.rho(self.squared_norm(state))))
+
+    def linearize(self, state: State) -> tuple[FloatArray, list[FloatArray]]:
+        """Return residuals (N, d) and Jacobians (N, d, dim) with noise, weight and kernel applied (IRLS).
+
+        Raises:
+            SolverError: If a Jacobian has the wrong shape or anything is not finite; names the variables.
+        """
+        r, jacobians = self.family.linearize(*self.gather(state), **self.data)
+        self._check(r, jacobians, state)
+        inverse_sigma = self._inverse_sigma()
+        r = r * inverse_sigma
+        scale = np.sqrt(self.weight * self.kernel.weight(np.einsum("nd,nd->n", r, r)))
+        r *= scale[:, None]
+        row_scale = (inverse_sigma * scale[:, None])[:, :, None]
+        return r, [jacobian * row_scale for jacobian in jacobians]
+
+    def _check(self, r: FloatArray, jacobians: list[FloatArray], state: State) -> None:
+        n, d = len(self), self.family.residual_dim
+        for slot, jacobian in zip(self.slots, jacobians, strict=True):
+            expected = (n, d, TANGENT_DIM[slot.group])
+            if jacobian.shape != expected:
+                raise SolverError(f"{self.name}: Jacobian of {slot.group} is {jacobian.shape}, not {expected}")
+        if r.shape != (n, d):
+            raise SolverError(f"{self.name}: residual is {r.shape}, not {(n, d)}")
+        finite = np.isfinite(r).all(axis=1)
+        for jacobian in jacobians:
+            finite &= np.isfinite(jacobian).all(axis=(1, 2))
+        if not finite.all():
+            row = int(np.flatnonzero(~finite)[0])
+            raise SolverError(
+                f"{self.name}: {int((~finite).sum())} of {n} factors are not finite; the first is on "
+                f"{self.describe_row(row, state)}. Check the cue values of that observation."
+            )
+
+    def describe_row(self, row: int, state: State) -> str:
+        """Return the decoded variables of one factor: "camera pose, frame 3 and landmark, track 17"."""
+        from uni4d_fg.graph.keys import decode
+
+        return " and ".join(str(decode(state.key(s.group, int(s.rows[row])))) for s in self.slots)

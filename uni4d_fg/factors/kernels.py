@@ -1,0 +1,85 @@
+r"""Robust kernels rho(s) on the whitened residual norm s >= 0.
+
+With e the noise in whitened units, a term costs ``rho(s)`` instead of ``s^2/2``; iteratively reweighted
+least squares uses the weight ``w(s) = rho'(s) / s`` (Holland and Welsch 1977; the same weights as GTSAM's
+``noiseModel.mEstimator``). c is the threshold.
+
+    quadratic      s^2 / 2                         w = 1
+    huber          s^2/2 | c s - c^2/2             w = min(1, c / s)
+    pseudo_huber   c^2 (sqrt(1 + (s/c)^2) - 1)     w = 1 / sqrt(1 + (s/c)^2)
+    cauchy         c^2/2 log(1 + (s/c)^2)          w = 1 / (1 + (s/c)^2)
+    norm           sqrt(s^2 + c^2) - c             w = 1 / sqrt(s^2 + c^2)
+
+``norm`` is the unsquared Euclidean norm smoothed at zero: slope 1 far away, so that a term's weight is the
+weight of the paper's unsquared norm. It tends to ``s`` as c tends to 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+
+KernelKind = Literal["quadratic", "huber", "pseudo_huber", "cauchy", "norm"]
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A robust kernel and its threshold c (whitened units)."""
+
+    kind: KernelKind = "quadratic"
+    threshold: float = 1.0
+
+    def rho(self, squared: FloatArray) -> FloatArray:
+        """Evaluate the kernel at squared norms s^2; same shape."""
+        c = self.threshold
+        result: FloatArray
+        if self.kind == "quadratic":
+            result = 0.5 * squared
+        elif self.kind == "huber":
+            result = np.where(squared <= c * c, 0.5 * squared, c * np.sqrt(squared) - 0.5 * c * c)
+        elif self.kind == "pseudo_huber":
+            result = c * c * _sqrt1p_minus1(squared / (c * c))
+        elif self.kind == "cauchy":
+            result = 0.5 * c * c * np.log1p(squared / (c * c))
+        else:
+            result = c * _sqrt1p_minus1(squared / (c * c))
+        return result
+
+    def weight(self, squared: FloatArray) -> FloatArray:
+        """Evaluate the weight rho'(s)/s at squared norms s^2; same shape, finite at zero."""
+        c = self.threshold
+        result: FloatArray
+        if self.kind == "quadratic":
+            result = np.ones_like(squared)
+        elif self.kind == "huber":
+            result = c / np.sqrt(np.maximum(squared, c * c))
+        elif self.kind == "pseudo_huber":
+            result = 1.0 / np.sqrt(1.0 + squared / (c * c))
+        elif self.kind == "cauchy":
+            result = 1.0 / (1.0 + squared / (c * c))
+        else:
+            result = 1.0 / np.sqrt(squared + c * c)
+        return result
+
+    def square_root(self, squared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the scale a(s) for which |a r|^2 / 2 = rho(s), and (da/ds) / s; both finite at zero.
+
+        A residual scaled by a(s) carries the kernel inside plain least squares: this is how a factor that
+        stacks several residuals is made robust row by row.
+        """
+        safe = np.maximum(squared, 1e-24)
+        rho = self.rho(safe)
+        a = np.sqrt(2.0 * rho / safe)
+        # a^2 = 2 rho / s^2  =>  a a' = rho'/s^2 - 2 rho/s^3, so a'/s = (w - a^2) / (a s^2)
+        slope = np.where(squared < 1e-12, 0.0, (self.weight(safe) - a * a) / (a * safe))
+        return a, slope
+
+
+def _sqrt1p_minus1(x: FloatArray) -> FloatArray:
+    """Return sqrt(1 + x) - 1 without cancellation for small x >= 0."""
+    result: FloatArray = x / (np.sqrt(1.0 + x) + 1.0)
+    return result

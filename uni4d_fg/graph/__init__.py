@@ -1,0 +1,1 @@
+"""Variables and their GTSAM keys, and problems made of factor batches."""
