@@ -1,0 +1,292 @@
+"""Files that are either whole or absent, and array files that are checked before they are believed."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import secrets
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path, PurePath
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.errors import InputError, OutputError
+
+MAX_NPZ_BYTES = 16 * 1024**3
+"""Uncompressed size above which an .npz file is refused."""
+
+_BROKEN_ARCHIVE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, OSError, RuntimeError)
+
+
+def write_failure(path: Path, error: OSError) -> OutputError:
+    """Return the error to raise when writing ``path`` failed: what, where, and what to do."""
+    reason = error.strerror or str(error) or type(error).__name__
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or "requested and" in reason:
+        # ndarray.tofile reports a full disk as "N requested and M written", without an errno.
+        reason = reason if error.errno else "No space left on device"
+        remedy = "free space or choose another --out"
+    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        remedy = "check the permissions of the folder or choose another --out"
+    else:
+        remedy = "choose another --out"
+    return OutputError(f"cannot write {path}: {reason}; {remedy}")
+
+
+def temporary_sibling(path: Path) -> Path:
+    """Return an unused hidden path in the folder of ``path`` that ends in the same name (and suffix)."""
+    return path.with_name(f".tmp-{secrets.token_hex(4)}-{path.name}")
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Write a file so that it appears whole or not at all.
+
+    Args:
+        path: Where the file shall be; its folder is made if absent. A symbolic link is written through.
+
+    Yields:
+        A temporary path in the same folder, with the same suffix, to write the file to. When the block ends
+        normally it is synced to disk and moved to ``path``; when it raises, it is removed.
+
+    Raises:
+        OutputError: If an ``OSError`` occurs in the block or while moving the file.
+    """
+    target = Path(os.path.realpath(path))
+    temporary = temporary_sibling(target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with open(temporary, "rb+") as stream:
+            os.fsync(stream.fileno())
+        os.replace(temporary, target)
+    except OSError as error:
+        raise write_failure(Path(path), error) from error
+    finally:
+        if temporary.exists():
+            temporary.unlink()
+
+
+def atomic_write_text(path: Path, text: str) -> None:
+    """Write ``text`` to ``path`` in UTF-8, whole or not at all.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Return ``value`` in JSON's own types; NaN and infinities, which JSON lacks, become null."""
+    if isinstance(value, Enum):
+        return _plain(value.value)
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(_plain(key)): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(item) for item in value]
+    return value
+
+
+def atomic_write_json(path: Path, value: Any) -> None:
+    """Write ``value`` to ``path`` as indented, strictly valid JSON, whole or not at all.
+
+    NumPy scalars and arrays, paths, enumerations and tuples are converted; NaN and infinity become null.
+
+    Raises:
+        OutputError: If it cannot be written.
+        TypeError: If ``value`` holds something that JSON cannot express.
+    """
+    atomic_write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def save_npy(path: Path, array: npt.ArrayLike) -> None:
+    """Write one array to ``path`` (``.npy``), whole or not at all.
+
+    Raises:
+        OutputError: If it cannot be written.
+        ValueError: If it is an object array, which could not be read back without pickle.
+    """
+    values = np.asarray(array)
+    if values.dtype.hasobject:
+        raise ValueError(f"{path}: an object array cannot be saved without pickle")
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        np.lib.format.write_array(stream, values, allow_pickle=False)
+
+
+def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
+    """Write named arrays to a compressed ``.npz``, whole or not at all.
+
+    Raises:
+        OutputError: If it cannot be written.
+        ValueError: If one is an object array, which could not be read back without pickle.
+    """
+    plain = {name: np.asarray(array) for name, array in arrays.items()}
+    for name, array in plain.items():
+        if array.dtype.hasobject:
+            raise ValueError(f"{path}: {name!r} is an object array and cannot be saved without pickle")
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in plain.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, array, allow_pickle=False)
+
+
+def _readable_file(path: Path, what: str) -> None:
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, but {what} file is expected here")
+    if not path.exists():
+        raise InputError(f"{path}: no such file; {what} file is expected here")
+
+
+def load_npy(path: Path, *, memory_map: bool = False) -> npt.NDArray[Any]:
+    """Read one numeric or boolean array of any shape from a ``.npy`` file.
+
+    Args:
+        path: The file.
+        memory_map: Map the file read-only instead of reading it, so that only what is used is loaded.
+
+    Raises:
+        InputError: If the file is missing, truncated, not a ``.npy`` file, or its dtype is not numeric.
+    """
+    _readable_file(path, "a .npy")
+    with _open_to_read(path) as stream:
+        if stream.read(6) != np.lib.format.MAGIC_PREFIX:
+            raise InputError(f"{path}: not a .npy file (or cut short); write it with numpy.save")
+        size = path.stat().st_size
+        stream.seek(0)
+        shape, dtype = _array_header(stream, f"{path}")
+        _check_size(shape, dtype, size - stream.tell(), f"{path}")
+    if dtype.kind not in "biuf":
+        raise InputError(f"{path}: dtype {dtype} is not numeric; write it again as numbers")
+    try:
+        array: npt.NDArray[Any] = np.load(path, mmap_mode="r" if memory_map and 0 not in shape else None)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: cannot be read as a .npy file ({error}); write it again") from error
+    except MemoryError as error:
+        raise InputError(f"{path}: an array of shape {shape} does not fit into memory") from error
+    return array
+
+
+def load_npz(
+    path: Path, required: Mapping[str, int | None], optional: Mapping[str, int | None] | None = None
+) -> dict[str, npt.NDArray[Any]]:
+    """Read arrays from an ``.npz`` file that may come from anywhere; nothing in it is executed.
+
+    Args:
+        path: The file.
+        required: Name to number of dimensions of the arrays that must be present. With a number the array
+            must be numeric or boolean; with None it may have any rank and may hold strings.
+        optional: The same for arrays that may be absent. None reads whatever else the file holds.
+
+    Returns:
+        Name to array: the required ones and those optional ones that are present.
+
+    Raises:
+        InputError: If the file is missing, truncated or not an ``.npz``, if an array is missing, has another
+            rank, or is an object array, or if the arrays would take more than 16 GiB.
+    """
+    _readable_file(path, "an .npz")
+    ranks = {**(optional or {}), **required}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {
+                info.filename.removesuffix(".npy"): info
+                for info in archive.infolist()
+                if info.filename.endswith(".npy")
+            }
+            missing = [name for name in required if name not in members]
+            if missing:
+                raise InputError(
+                    f"{path}: lacks {', '.join(map(repr, missing))}; it holds "
+                    f"{', '.join(map(repr, sorted(members))) or 'nothing'}"
+                )
+            wanted = [name for name in members if optional is None or name in ranks]
+            declared = sum(members[name].file_size for name in wanted)
+            if declared > MAX_NPZ_BYTES:
+                raise InputError(
+                    f"{path}: would take {declared / 1024**3:.1f} GiB when unpacked, more than "
+                    f"{MAX_NPZ_BYTES // 1024**3} GiB; store large arrays as .npy instead"
+                )
+            return {name: _read_member(archive, members[name], path, ranks.get(name)) for name in wanted}
+    except InputError:
+        raise
+    except MemoryError as error:
+        raise InputError(f"{path}: its arrays do not fit into memory") from error
+    except _BROKEN_ARCHIVE as error:
+        if isinstance(error, PermissionError):
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+        raise InputError(
+            f"{path}: not a readable .npz file, or cut short ({error}); write it again with numpy.savez"
+        ) from error
+
+
+@contextmanager
+def _open_to_read(path: Path) -> Iterator[IO[bytes]]:
+    try:
+        stream = open(path, "rb")  # noqa: SIM115 - closed below; only the opening may become an InputError
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+    with stream:
+        yield stream
+
+
+def _array_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Read the header of a .npy stream and refuse object arrays. Returns shape and dtype."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version == (1, 0):
+            shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+        elif version == (2, 0):
+            shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+        else:
+            raise InputError(f"{where}: .npy format version {version} is not supported; save a plain array")
+    except ValueError as error:
+        raise InputError(
+            f"{where}: its header is not that of a .npy array ({error}); write it again"
+        ) from error
+    if dtype.hasobject:
+        raise InputError(
+            f"{where}: holds Python objects, which are not loaded because reading them can run code; "
+            "save it as a plain numeric array"
+        )
+    return tuple(int(n) for n in shape), dtype
+
+
+def _check_size(shape: tuple[int, ...], dtype: np.dtype[Any], available: int, where: str) -> None:
+    """Refuse a header that announces more data than there is, before memory is set aside for it."""
+    expected = math.prod(shape) * dtype.itemsize
+    if any(n < 0 for n in shape) or expected > available:
+        raise InputError(
+            f"{where}: cut short: shape {shape} of {dtype} takes {expected} bytes, "
+            f"but only {available} follow; write it again"
+        )
+
+
+def _read_member(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, ndim: int | None
+) -> npt.NDArray[Any]:
+    name = info.filename.removesuffix(".npy")
+    where = f"{path}: array {name!r}"
+    with archive.open(info) as stream:
+        shape, dtype = _array_header(stream, where)
+        _check_size(shape, dtype, info.file_size - stream.tell(), where)
+    if ndim is not None and len(shape) != ndim:
+        raise InputError(f"{where} has shape {shape}, but {ndim} dimensions are expected")
+    if ndim is not None and dtype.kind not in "biuf":
+        raise InputError(f"{where} has dtype {dtype}, but numbers are expected")
+    with archive.open(info) as stream:
+        array: npt.NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    return array
