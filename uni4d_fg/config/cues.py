@@ -17,6 +17,7 @@ class TrackingConfig(Section):
     window_px: int = setting(21, "Side of the Lucas-Kanade window, px (odd).", ge=5, le=101)
     pyramid_levels: int = setting(3, "Pyramid levels above the full image.", ge=0, le=8)
     max_iterations: int = setting(30, "Lucas-Kanade iterations per level.", ge=1)
+    convergence_px: float = setting(0.01, "Lucas-Kanade stops when a point moves less than this, px.", gt=0)
     forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0)
     max_patch_error: float = setting(12.0, "Largest mean absolute grey-level difference of the window.", gt=0)
     min_texture: float = setting(1e-4, "Smallest eigenvalue of the window's gradient matrix (OpenCV scale).", ge=0)
