@@ -1,0 +1,32 @@
+"""Imports that can fail on a machine without certain system libraries, made to fail with a useful message."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from typing import Any
+
+from uni4d_fg.errors import MissingDependencyError
+
+_APT_COMMAND = "apt-get install libusb-1.0-0 libgl1 libgomp1"
+
+
+def import_open3d() -> Any:
+    """Import Open3D when it is first needed.
+
+    Returns:
+        The ``open3d`` module.
+
+    Raises:
+        MissingDependencyError: If the package or a system library that it loads is not installed.
+    """
+    try:
+        return importlib.import_module("open3d")
+    except ModuleNotFoundError as error:
+        if error.name == "open3d":
+            raise MissingDependencyError("open3d is not installed: run `pip install 'open3d>=0.19'`") from error
+        raise MissingDependencyError(f"open3d needs the Python package {error.name!r}: install it") from error
+    except (ImportError, OSError) as error:
+        library = re.search(r"lib[\w.+-]*\.so[.\d]*", str(error))
+        missing = f"the system library {library.group()} is missing" if library else str(error)
+        raise MissingDependencyError(f"open3d cannot be loaded, {missing}: run `{_APT_COMMAND}`") from error
