@@ -1,0 +1,1 @@
+"""Scores of a result against ground truth; every number names the protocol it was computed with."""
