@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import gtsam
@@ -71,7 +71,11 @@ class State:
                 return keys.dynamic_point_key(row, 0)
             track_frame = self.names.dynamic_track_frame[row]
             return keys.dynamic_point_key(int(track_frame[0]), int(track_frame[1]))
-        make = {"pose": keys.pose_key, "intrinsics": keys.intrinsics_key, "log_scale": keys.log_scale_key}
+        make: dict[str, Callable[[int], int]] = {
+            "pose": keys.pose_key,
+            "intrinsics": keys.intrinsics_key,
+            "log_scale": keys.log_scale_key,
+        }
         return make[group](row)
 
     def to_values(self, free: Mapping[str, BoolArray] | None = None) -> gtsam.Values:
