@@ -33,17 +33,19 @@ class LabelConfig(Section):
     band_weight: float = setting(
         0.0, "Weight of a kept track's observations inside the band; 0 drops them.", ge=0, le=1
     )
-    min_static_fraction: float = setting(
-        0.1,
-        "A static track must be surely seen in this fraction of the frames to carry a camera.",
-        ge=0,
-        le=1,
+    min_static_frames: int = setting(
+        5, "A static track must be surely seen in this many frames to carry a camera ...", ge=1
     )
-    min_static_frames: int = setting(5, "... and never in more than this many frames need it be.", ge=1)
+    min_static_fraction: float = setting(
+        0.5, "... or in this fraction of the frames where that is fewer (a short video).", ge=0, le=1
+    )
     max_off_label_fraction: float = setting(
         0.0, "Share of a track's sure observations that may disagree with its label (they are dropped).",
         ge=0, lt=0.5,
     )  # fmt: skip
+    max_depth_spread: float = setting(
+        0.05, "Depth is interpolated only between pixels that differ by less than this fraction.", ge=0
+    )
 
 
 class InputConfig(Section):
