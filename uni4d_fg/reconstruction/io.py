@@ -1,0 +1,116 @@
+"""Reading and writing of ``reconstruction.npz``, and the checks a reconstruction has to pass."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.errors import InputError, OutputError
+from uni4d_fg.files import load_npz, save_npz
+from uni4d_fg.reconstruction.model import Reconstruction
+
+FORMAT_VERSION = 1
+
+_ROTATION_TOLERANCE = 1e-6
+
+# Array name: (dtype, shape), with T frames, N landmarks and M dynamic tracks.
+_LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
+    "world_T_cam": ("float64", ("T", 4, 4)),
+    "intrinsics": ("float64", (4,)),
+    "timestamps": ("float64", ("T",)),
+    "image_size": ("int64", (2,)),
+    "depth_log_scale": ("float64", ("T",)),
+    "landmarks": ("float64", ("N", 3)),
+    "landmark_track": ("int32", ("N",)),
+    "landmark_color": ("uint8", ("N", 3)),
+    "landmark_error": ("float32", ("N",)),
+    "dynamic_points": ("float64", ("M", "T", 3)),
+    "dynamic_observed": ("bool", ("M", "T")),
+    "dynamic_track": ("int32", ("M",)),
+    "dynamic_instance": ("int32", ("M",)),
+    "dynamic_color": ("uint8", ("M", 3)),
+}
+
+
+def save_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
+    """Write a reconstruction to an ``.npz``, whole or not at all.
+
+    Raises:
+        OutputError: If it is not a valid reconstruction (it could not be read back) or cannot be written.
+    """
+    arrays = {name: np.asarray(getattr(reconstruction, name)) for name in _LAYOUT}
+    problem = _problem(arrays)
+    if problem:
+        raise OutputError(f"{path}: not written, the reconstruction is not valid: {problem}")
+    typed = {name: arrays[name].astype(dtype) for name, (dtype, _) in _LAYOUT.items()}
+    save_npz(path, format_version=np.int64(FORMAT_VERSION), **typed)
+
+
+def load_reconstruction(path: Path) -> Reconstruction:
+    """Read a reconstruction and check it.
+
+    Raises:
+        InputError: If the file is missing, damaged, of a newer format, or holds arrays whose shapes
+            disagree, values that are not finite where they must be, or poses that are not rigid.
+    """
+    version = load_npz(path, {"format_version": 0}, {})["format_version"]
+    if version != FORMAT_VERSION:
+        raise InputError(
+            f"{path}: format version {version}, but this program reads version {FORMAT_VERSION}; "
+            "use the version of uni4d_fg that wrote it"
+        )
+    arrays = load_npz(path, {name: len(shape) for name, (_, shape) in _LAYOUT.items()}, {})
+    problem = _problem(arrays)
+    if problem:
+        raise InputError(f"{path}: not a valid reconstruction: {problem}")
+    values: dict[str, Any] = {name: arrays[name].astype(dtype) for name, (dtype, _) in _LAYOUT.items()}
+    height, width = values.pop("image_size").tolist()
+    return Reconstruction(image_size=(height, width), **values)
+
+
+def _problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
+    """Return what is wrong with the arrays of a reconstruction, or None."""
+    sizes: dict[str, int] = {}
+    for name, (dtype, shape) in _LAYOUT.items():
+        actual = arrays[name].shape
+        expected = "(" + ", ".join(map(str, shape)) + ")"
+        if len(actual) != len(shape):
+            return f"{name} has shape {actual}, expected {expected}"
+        for length, symbol in zip(actual, shape, strict=True):
+            wanted = symbol if isinstance(symbol, int) else sizes.setdefault(symbol, length)
+            if length != wanted:
+                known = "".join(f", {key} = {value}" for key, value in sizes.items())
+                return f"{name} has shape {actual}, expected {expected}{known}"
+        if dtype.startswith(("int", "uint")) and arrays[name].dtype.kind not in "iu":
+            return f"{name} has dtype {arrays[name].dtype}, expected {dtype}"
+        if dtype == "bool" and arrays[name].dtype.kind != "b":
+            return f"{name} has dtype {arrays[name].dtype}, expected bool"
+        if name not in ("dynamic_points", "landmark_error") and not np.isfinite(arrays[name]).all():
+            return f"{name} has a value that is NaN or infinite"
+    return _value_problem(arrays)
+
+
+def _value_problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
+    poses = arrays["world_T_cam"]
+    if not len(poses):
+        return "it has no frame"
+    rotation = poses[:, :3, :3]
+    deviation = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    rigid = (deviation <= _ROTATION_TOLERANCE) & (np.linalg.det(rotation) > 0.0)
+    rigid &= (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    if not rigid.all():
+        return f"pose {int(np.argmin(rigid))} is not a rigid transform"
+    if (np.diff(arrays["timestamps"]) <= 0.0).any():
+        return "timestamps do not increase"
+    if (arrays["intrinsics"][:2] <= 0.0).any() or (arrays["image_size"] <= 0).any():
+        return "focal lengths and image size must be positive"
+    if np.isinf(arrays["dynamic_points"]).any():
+        return "dynamic_points has an infinite value"
+    if not np.isfinite(arrays["dynamic_points"][arrays["dynamic_observed"]]).all():
+        return "an observed dynamic point has no position"
+    if np.isinf(arrays["landmark_error"]).any():
+        return "landmark_error has an infinite value"
+    return None
