@@ -19,6 +19,11 @@ class TrackingConfig(Section):
     max_iterations: int = setting(30, "Lucas-Kanade iterations per level.", ge=1)
     convergence_px: float = setting(0.01, "Lucas-Kanade stops when a point moves less than this, px.", gt=0)
     forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0)
+    max_drift_px: float | None = setting(
+        2.0,
+        "Largest distance between a point and where its first appearance is found, px; null: not checked.",
+        gt=0,
+    )
     max_patch_error: float = setting(12.0, "Largest mean absolute grey-level difference of the window.", gt=0)
     min_texture: float = setting(1e-4, "Smallest eigenvalue of the window's gradient matrix (OpenCV scale).", ge=0)
     border_px: float = setting(1.0, "A point closer than this to the image border is lost, px.", ge=0)

@@ -2,26 +2,27 @@
 
 A grid of query points is started in frames 0, ``query_interval``, 2 ``query_interval``, ... Two sweeps over
 the video follow them: one forwards, in which every grid joins as the sweep passes its frame, and one
-backwards. Each step moves all live points of all grids at once, so that a video costs two optical-flow calls
-per pair of frames and sweep, however many grids there are, and only the two images of the step are held.
+backwards. A step moves all live points of all grids at once, so that a sweep costs two optical-flow calls
+per pair of frames, however many grids there are, plus a short one per live grid for the drift check. Only
+the two images of the step and the grey query images of live grids are held.
 
-A point is lost, and never found again in that sweep, when Lucas-Kanade gives up on it (no texture), when
-tracking it back misses where it came from, when its window looks different, or when it leaves the image.
+A point that fails a check of :mod:`uni4d_fg.tracks.optical_flow` is lost, and not looked for again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray, IntArray
+from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array, IntArray
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.sequence.model import FrameSource
 from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.tracks.optical_flow import has_not_drifted, move_points
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the number of steps in all."""
@@ -70,86 +71,64 @@ def track_grid(
     image_size = _grey(images[0], None, 0).shape
     grid = query_grid((image_size[0], image_size[1]), config)
     query_frames = list(range(0, num_frames, config.query_interval))
-    first_track = {frame: i * len(grid) for i, frame in enumerate(query_frames)}
-
-    observations: _Observations = []
-    for frame in query_frames:
-        observations.append((frame, first_track[frame] + np.arange(len(grid)), grid))
+    observations: _Observations = [(frame, _track_indices(i, grid), grid) for i, frame in enumerate(query_frames)]
     steps_done, steps = 0, 2 * (num_frames - 1)
     for order in (range(num_frames), range(num_frames - 1, -1, -1)):
-        live = np.zeros(0, np.int64)
-        points = np.zeros((0, 2), np.float32)
+        live = _LivePoints(grid)
         previous: ImageArray | None = None
         for frame in order:
             if should_stop is not None and should_stop():
                 raise Cancelled(f"tracking stopped at step {steps_done} of {steps}")
             image = _grey(images[frame], image_size, frame)
             if previous is not None:
-                kept, points = step(previous, image, points, config)
-                live = live[kept]
-                observations.append((frame, live, points))
+                live.move(previous, image, config)
+                observations.append((frame, live.track, live.points))
                 steps_done += 1
                 if progress is not None:
                     progress(steps_done, steps)
-            if frame in first_track:
-                live = np.concatenate((live, first_track[frame] + np.arange(len(grid))))
-                points = np.concatenate((points, grid))
+            if frame % config.query_interval == 0:
+                live.start(frame // config.query_interval, image)
             previous = image
     query_frame = np.repeat(np.asarray(query_frames, np.int32), len(grid))
     return _assemble(observations, query_frame, num_frames, config.min_observations)
 
 
-def step(
-    source: ImageArray, target: ImageArray, points: Float32Array, config: TrackingConfig
-) -> tuple[BoolArray, Float32Array]:
-    """Move points from one grey image to the next.
+@dataclass
+class _LivePoints:
+    """The points that one sweep follows at present.
 
-    Args:
-        source: (H, W) uint8, the image in which the points are known.
-        target: (H, W) uint8.
-        points: (N, 2) px in ``source``.
-        config: Window and checks.
-
-    Returns:
-        kept: (N,) True for the M points that passed every check.
-        moved: (M, 2) their pixels in ``target``.
+    Track ``i`` belongs to grid ``i // len(grid)`` and started at query point ``i % len(grid)`` of it.
     """
-    kept = np.zeros(len(points), np.bool_)
-    if len(points) == 0:
-        return kept, points
-    moved, found, difference = _flow(source, target, points, config)
-    height, width = target.shape
-    border = config.border_px
-    inside = (moved >= border).all(axis=1) & (moved <= (width - 1 - border, height - 1 - border)).all(axis=1)
-    candidate = np.flatnonzero(found & inside & (difference <= config.max_patch_error))
-    if len(candidate) == 0:
-        return kept, moved[:0]
-    back, found_back, _ = _flow(target, source, moved[candidate], config)
-    miss = np.linalg.norm(back - points[candidate], axis=1)
-    survivors = candidate[found_back & (miss <= config.forward_backward_px)]
-    kept[survivors] = True
-    return kept, moved[survivors]
+
+    grid: Float32Array
+    track: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    query_images: dict[int, ImageArray] = field(default_factory=dict)
+
+    def start(self, grid_index: int, image: ImageArray) -> None:
+        """Add the points of a grid in the frame where they start."""
+        self.track = np.concatenate((self.track, _track_indices(grid_index, self.grid)))
+        self.points = np.concatenate((self.points, self.grid))
+        self.query_images[grid_index] = image
+
+    def move(self, source: ImageArray, target: ImageArray, config: TrackingConfig) -> None:
+        """Follow all points to the next image and forget those that are lost."""
+        kept, self.points = move_points(source, target, self.points, config)
+        self.track = self.track[kept]
+        grid_of_track, query_point = np.divmod(self.track, len(self.grid))
+        keep = np.ones(len(self.track), np.bool_)
+        for grid_index, query_image in list(self.query_images.items()):
+            members = np.flatnonzero(grid_of_track == grid_index)
+            keep[members] = has_not_drifted(
+                query_image, target, self.grid[query_point[members]], self.points[members], config
+            )
+            if not keep[members].any():
+                del self.query_images[grid_index]
+        self.track, self.points = self.track[keep], self.points[keep]
 
 
-def _flow(
-    source: ImageArray, target: ImageArray, points: Float32Array, config: TrackingConfig
-) -> tuple[Float32Array, BoolArray, Float32Array]:
-    """Return moved points (N, 2), found (N,) and the mean absolute grey-level difference (N,)."""
-    moved, status, difference = cv2.calcOpticalFlowPyrLK(
-        source,
-        target,
-        np.ascontiguousarray(points),
-        None,
-        winSize=(config.window_px, config.window_px),
-        maxLevel=config.pyramid_levels,
-        criteria=(
-            cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT,
-            config.max_iterations,
-            config.convergence_px,
-        ),
-        minEigThreshold=config.min_texture,
-    )
-    return moved.reshape(-1, 2), status.ravel() > 0, difference.ravel()
+def _track_indices(grid_index: int, grid: Float32Array) -> IntArray:
+    return np.arange(grid_index * len(grid), (grid_index + 1) * len(grid), dtype=np.int64)
 
 
 def _grey(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> ImageArray:
@@ -167,7 +146,7 @@ def _grey(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> Im
 
 def _assemble(
     observations: _Observations,
-    query_frame: npt.NDArray[np.int32],
+    query_frame: Int32Array,
     num_frames: int,
     min_observations: int,
 ) -> Tracks:
