@@ -1,0 +1,1 @@
+"""Dense depth that agrees with the sparse points, and the 4D cloud."""
