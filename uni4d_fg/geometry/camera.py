@@ -83,11 +83,11 @@ def world_to_camera(world_T_cam: Array, point_world: Array) -> Array:
     xp = namespace(point_world)
     d = point_world - world_T_cam[..., :3, 3]
     rotation = world_T_cam[..., :3, :3]
-    return xp.sum(rotation * d[..., :, None], axis=-2)
+    return xp.einsum("...ji,...j->...i", rotation, d)
 
 
 def camera_to_world(world_T_cam: Array, point_cam: Array) -> Array:
     """Express camera-frame points in the world: ``R x + c``. Shapes as in :func:`world_to_camera`."""
     xp = namespace(point_cam)
     rotation = world_T_cam[..., :3, :3]
-    return xp.sum(rotation * point_cam[..., None, :], axis=-1) + world_T_cam[..., :3, 3]
+    return xp.einsum("...ij,...j->...i", rotation, point_cam) + world_T_cam[..., :3, 3]

@@ -12,7 +12,6 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import SolverError
 from uni4d_fg.graph.keys import decode
 from uni4d_fg.solve.objective import Step
@@ -54,7 +53,7 @@ class GraphObjective:
         """Linearise every factor; raises SolverError naming the factor that is not finite."""
         gaussian = self.graph.linearize(state)
         gradient = gaussian.gradientAtZero()
-        keys = [key for key in state.keys() if gradient.exists(key)]
+        keys = [key for key in list(state.keys()) if gradient.exists(key)]
         vector = gradient.vector(keys)
         if not np.isfinite(vector).all():
             raise SolverError(self._blame(state))
@@ -72,7 +71,7 @@ class GraphObjective:
         """Name the variables whose information is zero and the factors that touch them."""
         gaussian = self.graph.linearize(state)
         names = []
-        for key in state.keys():
+        for key in list(state.keys()):
             touching = [i for i in range(self.graph.size()) if key in list(self.graph.at(i).keys())]
             single = gtsam.GaussianFactorGraph()
             for i in touching:

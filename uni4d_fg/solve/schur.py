@@ -6,9 +6,11 @@ The Gauss-Newton system of a problem whose factors read at most one row of the e
     [ E^T   V ] [d_l] = - [g_l],     V block-diagonal with 3x3 blocks.
 
 Eliminating d_l leaves S = H_cc - E V^{-1} E^T on the cameras (poses, intrinsics, log-scales), which is
-dense for long tracks and is solved by Cholesky; then each landmark is back-substituted on its own. E is
-formed in chunks of landmarks that share a range of frames, so that S is a sum of dense products (BLAS) and
-memory stays bounded. Marquardt damping is applied to landmarks and cameras alike, before elimination.
+dense for long tracks and is solved by Cholesky; then each landmark is back-substituted on its own. All work
+is cut into chunks of landmarks that share a range of frames: a chunk's factors fit the cache, its part of E
+is one dense block, S is a sum of dense products, and chunks run on several threads. Partial sums are added
+in a fixed order, so that the result does not depend on the number of threads. Marquardt damping is applied
+to landmarks and cameras alike, before elimination.
 Source: Triggs et al. 2000, "Bundle adjustment - a modern synthesis".
 
 With nothing to eliminate this is a dense normal-equation solver, as camera initialisation needs.
@@ -16,62 +18,67 @@ With nothing to eliminate this is a dense normal-equation solver, as camera init
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import scipy.linalg
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.solver import SolverConfig
-from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.graph.keys import decode
 from uni4d_fg.graph.problem import Problem
-from uni4d_fg.graph.state import TANGENT_DIM, State
+from uni4d_fg.graph.state import State
+from uni4d_fg.solve.chunks import BatchPart, Chunk, plan_chunks
 from uni4d_fg.solve.layout import DenseLayout
 from uni4d_fg.solve.objective import Step
+from uni4d_fg.solve.threads import one_blas_thread, thread_count
 
-_CHUNK = 1024
-"""Landmarks eliminated together: large enough for BLAS, small enough for the cache."""
-
-
-@dataclass(frozen=True)
-class _BatchPlan:
-    """A batch, its rows sorted by camera variables, and where its blocks go."""
-
-    batch: FactorBatch
-    camera_slots: tuple[int, ...]
-    landmark_slot: int | None
-    group_start: IntArray
-    """First row of each run of rows with the same camera variables, plus the end."""
-    columns: IntArray
-    """(runs, D) columns of the camera Jacobian of each run."""
-    by_landmark: IntArray
-    """Rows sorted by landmark."""
-    landmark_start: IntArray
-    """(N_landmarks + 1,) first position of each landmark in ``by_landmark``."""
-    unique_pairs: tuple[bool, ...]
-    """Per camera slot: no two rows share both the landmark and the camera variable."""
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True)
-class _BatchBlocks:
-    """What of a linearised batch the elimination needs."""
+class _ChunkBlocks:
+    """Normal equations of one chunk."""
 
-    coupling: FloatArray
-    """(N, 3, D) J_l^T J_c per row."""
+    camera_columns: IntArray
+    """(c,) dense columns that the chunk's factors touch, ascending."""
+    camera_hessian: FloatArray
+    """(c, c)."""
+    camera_gradient: FloatArray
+    """(c,)."""
+    point_hessian: FloatArray
+    """(n, 3, 3)."""
+    point_gradient: FloatArray
+    """(n, 3)."""
+    coupling: list[FloatArray]
+    """Per span of the chunk (n, width, 3): J_c^T J_l, dense."""
+    span_columns: IntArray
+    """(sum of widths,) dense columns of the concatenated spans."""
 
 
 class SchurObjective:
     """A :class:`Problem` whose linear systems are solved by eliminating one group of points."""
 
-    def __init__(self, problem: Problem, state: State, config: SolverConfig, eliminate: str | None = "landmark"):
+    def __init__(
+        self,
+        problem: Problem,
+        state: State,
+        config: SolverConfig,
+        eliminate: str | None = "landmark",
+        threads: int | None = None,
+    ):
         """Plan the sparsity once; it does not change between linearisations.
 
         Args:
-            problem: Batches and free entries. The eliminated group is free as a whole row or frozen.
+            problem: Batches and free entries. A row of the eliminated group is free as a whole or frozen.
             state: Any state of the problem (only array lengths are read).
             config: Bounds of the damping diagonal.
             eliminate: Group of 3-vectors to eliminate; None, or a frozen group, eliminates nothing.
+            threads: Worker threads; the number of cores when None.
         """
         self.problem, self.config = problem, config
         self.eliminate = eliminate if eliminate is not None and problem.is_free(eliminate) else None
@@ -81,98 +88,57 @@ class SchurObjective:
         self.landmark_free: BoolArray = np.zeros(0, dtype=bool)
         if self.eliminate is not None:
             self.landmark_free = np.asarray(problem.free[self.eliminate].all(axis=1))
-        self.plans = [plan for batch in problem.batches if (plan := self._plan(batch)) is not None]
-        self.chunks = self._plan_chunks()
-
-    def _plan(self, batch: FactorBatch) -> _BatchPlan | None:
-        camera_slots = tuple(i for i, s in enumerate(batch.slots) if s.group in self.layout.offset)
-        landmark = [i for i, s in enumerate(batch.slots) if s.group == self.eliminate]
-        if len(batch) == 0 or not (camera_slots or landmark):
-            return None
-        order = np.arange(len(batch))
-        if camera_slots:
-            order = np.lexsort([batch.slots[i].rows for i in reversed(camera_slots)])
-        batch = batch.take(order)
-        rows = np.stack([batch.slots[i].rows for i in camera_slots] or [np.zeros(len(batch), dtype=np.int64)], axis=1)
-        new_run = np.flatnonzero(np.r_[True, (np.diff(rows, axis=0) != 0).any(axis=1)])
-        columns = [self.layout.columns(batch.slots[i].group, batch.slots[i].rows[new_run]) for i in camera_slots]
-        by_landmark, start = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
-        if landmark:
-            landmark_rows = batch.slots[landmark[0]].rows
-            by_landmark = np.argsort(landmark_rows, kind="stable")
-            start = np.searchsorted(landmark_rows[by_landmark], np.arange(self.num_landmarks + 1))
-        return _BatchPlan(
-            batch,
-            camera_slots,
-            landmark[0] if landmark else None,
-            np.r_[new_run, len(batch)],
-            np.concatenate([*columns, np.zeros((len(new_run), 0), dtype=np.int64)], axis=1),
-            by_landmark,
-            start,
-            tuple(_pairs_are_unique(batch, i, landmark) for i in camera_slots),
-        )
-
-    def _plan_chunks(self) -> list[IntArray]:
-        """Order landmarks by the first frame that sees them, and cut them into chunks."""
-        if self.num_landmarks == 0:
-            return []
-        first = np.full(self.num_landmarks, np.iinfo(np.int64).max)
-        for plan in self.plans:
-            if plan.landmark_slot is None:
-                continue
-            for i in plan.camera_slots:
-                slot = plan.batch.slots[i]
-                if self.layout.count[slot.group] > 1:
-                    np.minimum.at(first, plan.batch.slots[plan.landmark_slot].rows, slot.rows)
-        order = np.argsort(first, kind="stable")
-        order = order[self.landmark_free[order]]
-        return [order[i : i + _CHUNK] for i in range(0, len(order), _CHUNK)]
+        self.chunks = plan_chunks(problem, self.layout, self.eliminate, self.num_landmarks)
+        self.threads = min(thread_count(threads), max(len(self.chunks), 1))
+        # E is by far the largest array: allocated once, overwritten by every linearisation.
+        self._coupling = [
+            [np.zeros((len(chunk.landmarks), span.count, span.dim, 3)) for span in chunk.spans]
+            for chunk in self.chunks
+        ]
 
     def energies(self, state: State) -> dict[str, float]:
         """Return the energy per term."""
-        return self.problem.energies(state)
+        parts = [part for chunk in self.chunks for part in chunk.parts]
+        planned = self._map(lambda part: part.batch.energy(state), parts)
+        out = {batch.name: 0.0 for batch in self.problem.batches}
+        for part, energy in zip(parts, planned, strict=True):
+            out[part.batch.name] += energy
+        for batch in self.problem.batches:
+            if not any(s.group in self.layout.offset or s.group == self.eliminate for s in batch.slots):
+                out[batch.name] += batch.energy(state)
+        return out
 
     def retract(self, state: State, delta: dict[str, FloatArray]) -> State:
         """Return ``state`` moved by a step per group."""
         return state.retract(delta)
 
     def linearize(self, state: State) -> SchurLinearization:
-        """Accumulate the normal equations at ``state``."""
-        size, count = self.layout.size, self.num_landmarks
-        hessian, gradient = np.zeros((size, size)), np.zeros(size)
-        point_hessian, point_gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        blocks: list[_BatchBlocks | None] = []
-        for plan in self.plans:
-            r, jacobians = plan.batch.linearize(state)
-            camera = np.concatenate([*(jacobians[i] for i in plan.camera_slots), np.zeros((*r.shape, 0))], axis=2)
-            _add_camera_blocks(plan, camera, r, hessian, gradient)
-            if plan.landmark_slot is None:
-                blocks.append(None)
-                continue
-            by_point = jacobians[plan.landmark_slot]
-            rows = plan.batch.slots[plan.landmark_slot].rows
-            _add_point_blocks(rows, by_point, r, point_hessian, point_gradient)
-            blocks.append(_BatchBlocks(np.swapaxes(by_point, 1, 2) @ camera))
-        return SchurLinearization(self, hessian, gradient, point_hessian, point_gradient, blocks)
+        """Accumulate the normal equations at ``state``; they are valid until the next call."""
+        indices = list(range(len(self.chunks)))
+        blocks = self._map(lambda i: _linearize_chunk(self.chunks[i], state, self._coupling[i]), indices)
+        return SchurLinearization(self, blocks)
+
+    def _map(self, function: Callable[[ItemT], ResultT], items: list[ItemT]) -> list[ResultT]:
+        """Apply a function to every item on the worker threads; results in the order of the items."""
+        if self.threads == 1 or len(items) < 2:
+            return [function(item) for item in items]
+        with one_blas_thread(), ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(function, items))
 
     def diagnose(self, state: State) -> str:
         """Name the free variables that no factor determines."""
-        model = self.linearize(state)
-        diagonal = np.diag(model.hessian)
+        diagonal = np.diag(self.linearize(state).hessian)
         weak = np.flatnonzero(self.layout.free & ~(diagonal > 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-300)))
         names = []
-        for column in weak[:5]:
-            group, row, _ = self.layout.locate(int(column))
-            name = str(decode(state.key(group, row)))
-            terms = sorted(
-                {
-                    plan.batch.name
-                    for plan in self.plans
-                    for i in plan.camera_slots
-                    if plan.batch.slots[i].group == group and (plan.batch.slots[i].rows == row).any()
-                }
-            )
-            names.append(f"{name} (factors: {', '.join(terms) or 'none'})")
+        for column in weak[:5].tolist():
+            group, row, _ = self.layout.locate(column)
+            terms = {
+                batch.name
+                for batch in self.problem.batches
+                for slot in batch.slots
+                if slot.group == group and (slot.rows == row).any()
+            }
+            names.append(f"{decode(state.key(group, row))} (factors: {', '.join(sorted(terms)) or 'none'})")
         if names:
             listed = "; ".join(dict.fromkeys(names))
             return f"Not determined: {listed}. Give it observations or a prior, or freeze it."
@@ -182,194 +148,189 @@ class SchurObjective:
         )
 
 
+def _linearize_chunk(chunk: Chunk, state: State, coupling: list[FloatArray]) -> _ChunkBlocks:
+    width, count = len(chunk.camera_columns), len(chunk.landmarks)
+    hessian, gradient = np.zeros((width, width)), np.zeros(width)
+    point_hessian, point_gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for block in coupling:
+        block.fill(0.0)
+    for part in chunk.parts:
+        r, jacobians = part.batch.linearize(state)
+        camera = np.concatenate([*(jacobians[i] for i in part.camera_slots), np.zeros((*r.shape, 0))], axis=2)
+        _add_camera_blocks(part, camera, r, hessian, gradient)
+        if part.landmark_slot is None:
+            continue
+        by_point = jacobians[part.landmark_slot]
+        _add_point_blocks(part.landmark, by_point, r, point_hessian, point_gradient)
+        products = np.swapaxes(camera, 1, 2) @ by_point
+        for target in part.coupling:
+            values = products[:, target.start : target.stop]
+            _add_coupling(coupling[target.span], part.landmark, target.row, values, target.unique)
+    flat = [block.reshape(count, block.shape[1] * block.shape[2], 3) for block in coupling]
+    return _ChunkBlocks(
+        chunk.camera_columns, hessian, gradient, point_hessian, point_gradient, flat, chunk.span_columns
+    )
+
+
 def _add_camera_blocks(
-    plan: _BatchPlan, camera: FloatArray, r: FloatArray, hessian: FloatArray, gradient: FloatArray
+    part: BatchPart, camera: FloatArray, r: FloatArray, hessian: FloatArray, gradient: FloatArray
 ) -> None:
     width = camera.shape[2]
     if width == 0:
         return
-    for run, columns in enumerate(plan.columns):
-        rows = slice(plan.group_start[run], plan.group_start[run + 1])
+    for run, columns in enumerate(part.columns):
+        rows = slice(part.run_start[run], part.run_start[run + 1])
         a = camera[rows].reshape(-1, width)
-        hessian[np.ix_(columns, columns)] += a.T @ a
-        gradient[columns] += a.T @ r[rows].reshape(-1)
+        # A variable may stand in two slots of one factor: add, entry by entry, only then.
+        if part.distinct_columns:
+            hessian[np.ix_(columns, columns)] += a.T @ a
+            gradient[columns] += a.T @ r[rows].reshape(-1)
+        else:
+            np.add.at(hessian, np.ix_(columns, columns), a.T @ a)
+            np.add.at(gradient, columns, a.T @ r[rows].reshape(-1))
 
 
 def _add_point_blocks(
-    rows: IntArray, by_point: FloatArray, r: FloatArray, point_hessian: FloatArray, point_gradient: FloatArray
+    landmark: IntArray, by_point: FloatArray, r: FloatArray, point_hessian: FloatArray, point_gradient: FloatArray
 ) -> None:
     count = len(point_hessian)
     for a in range(3):
-        point_gradient[:, a] += np.bincount(rows, np.einsum("nd,nd->n", by_point[:, :, a], r), count)
+        point_gradient[:, a] += np.bincount(landmark, np.einsum("nd,nd->n", by_point[:, :, a], r), count)
         for b in range(a, 3):
-            block = np.bincount(rows, np.einsum("nd,nd->n", by_point[:, :, a], by_point[:, :, b]), count)
+            block = np.bincount(landmark, np.einsum("nd,nd->n", by_point[:, :, a], by_point[:, :, b]), count)
             point_hessian[:, a, b] += block
             if a != b:
                 point_hessian[:, b, a] += block
 
 
-@dataclass
+def _add_coupling(dense: FloatArray, landmark: IntArray, row: IntArray, values: FloatArray, unique: bool) -> None:
+    """Add (n, dim, 3) blocks into dense[landmark, row]; pairs may repeat (shared intrinsics do)."""
+    if unique:
+        dense[landmark, row] += values
+    elif dense.shape[1] == 1:
+        flat = values.reshape(len(values), -1)
+        summed = np.stack([np.bincount(landmark, flat[:, j], len(dense)) for j in range(flat.shape[1])], axis=1)
+        dense[:, 0] += summed.reshape(len(dense), *values.shape[1:])
+    else:
+        np.add.at(dense, (landmark, row), values)
+
+
 class SchurLinearization:
     """The normal equations at one point."""
 
-    objective: SchurObjective
-    hessian: FloatArray
-    gradient: FloatArray
-    point_hessian: FloatArray
-    point_gradient: FloatArray
-    blocks: list[_BatchBlocks | None]
-    _free: IntArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._free = np.flatnonzero(self.objective.layout.free)
+    def __init__(self, objective: SchurObjective, blocks: list[_ChunkBlocks]):
+        self.objective, self.blocks = objective, blocks
+        size = objective.layout.size
+        self.hessian, self.gradient = np.zeros((size, size)), np.zeros(size)
+        for block in blocks:
+            self.hessian[np.ix_(block.camera_columns, block.camera_columns)] += block.camera_hessian
+            self.gradient[block.camera_columns] += block.camera_gradient
+        self._free = np.flatnonzero(objective.layout.free)
 
     @property
     def gradient_max(self) -> float:
         """Largest absolute entry of the gradient over the free entries."""
-        camera = np.abs(self.gradient[self._free]).max(initial=0.0)
-        point = np.abs(self.point_gradient[self.objective.landmark_free]).max(initial=0.0)
-        return float(max(camera, point))
+        point = [np.abs(block.point_gradient).max(initial=0.0) for block in self.blocks]
+        return float(max(np.abs(self.gradient[self._free]).max(initial=0.0), *point, 0.0))
 
     def _clamped(self, diagonal: FloatArray) -> FloatArray:
         config = self.objective.config
         return np.clip(diagonal, config.min_diagonal, config.max_diagonal)
 
-    def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return S, its right-hand side (both over all columns) and the inverse point factors (N, 3, 3).
+    def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, list[FloatArray]] | None:
+        """Eliminate the landmarks.
 
-        None when a damped landmark block is not positive definite.
+        Returns:
+            S (size, size) and its right-hand side (size,) over all columns, frozen ones included, and the
+            inverse Cholesky factor of every landmark's damped block per chunk, (n, 3, 3); None when a
+            landmark's block is not positive definite.
         """
         size = self.objective.layout.size
-        schur = self.hessian.copy()
+        schur, rhs = self.hessian.copy(), -self.gradient
         schur[np.arange(size), np.arange(size)] += damping * self._clamped(np.diag(self.hessian))
-        rhs = -self.gradient
-        point = self.point_hessian.copy()
-        index = np.arange(3)
-        point[:, index, index] += damping * self._clamped(self.point_hessian[:, index, index])
+
+        def eliminate(block: _ChunkBlocks) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+            return self._eliminate(block, damping)
+
+        factors = []
+        for block, part in zip(self.blocks, self.objective._map(eliminate, self.blocks), strict=True):
+            if part is None:
+                return None
+            inverse_factor, product, product_rhs = part
+            columns = block.span_columns
+            schur[np.ix_(columns, columns)] -= product
+            rhs[columns] += product_rhs
+            factors.append(inverse_factor)
+        return schur, rhs, factors
+
+    def _eliminate(self, block: _ChunkBlocks, damping: float) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Return L^{-1} (n, 3, 3), E V^{-1} E^T and E V^{-1} g_l of one chunk, V = L L^T damped."""
+        count, width = len(block.point_gradient), len(block.span_columns)
+        point, index = block.point_hessian.copy(), np.arange(3)
+        point[:, index, index] += damping * self._clamped(block.point_hessian[:, index, index])
         try:
-            inverse_factor = np.linalg.inv(np.linalg.cholesky(point)) if len(point) else point
+            inverse_factor = np.linalg.inv(np.linalg.cholesky(point)) if count else point
         except np.linalg.LinAlgError:
             return None
-        for chunk in self.objective.chunks:
-            self._eliminate(chunk, inverse_factor, schur, rhs)
-        return schur, rhs, inverse_factor
-
-    def _eliminate(self, chunk: IntArray, inverse_factor: FloatArray, schur: FloatArray, rhs: FloatArray) -> None:
-        """Subtract E V^{-1} E^T and E V^{-1} g_l of one chunk of landmarks."""
-        coupling, columns = self._coupling(chunk)
-        factor = inverse_factor[chunk]
-        whitened = (factor @ coupling).reshape(-1, coupling.shape[2])
-        whitened_gradient = (factor @ self.point_gradient[chunk, :, None]).reshape(-1)
-        schur[np.ix_(columns, columns)] -= whitened.T @ whitened
-        rhs[columns] += whitened.T @ whitened_gradient
-
-    def _coupling(self, chunk: IntArray) -> tuple[FloatArray, IntArray]:
-        """Return E^T of a chunk, (landmarks, 3, columns), and the dense columns it spans."""
-        layout = self.objective.layout
-        local = np.full(self.objective.num_landmarks, -1)
-        local[chunk] = np.arange(len(chunk))
-        pieces: list[tuple[str, IntArray, IntArray, FloatArray, bool]] = []
-        for plan, block in zip(self.objective.plans, self.blocks, strict=True):
-            if block is None or plan.landmark_slot is None or not plan.camera_slots:
-                continue
-            rows = _rows_of(plan, chunk)
-            landmark = local[plan.batch.slots[plan.landmark_slot].rows[rows]]
-            start = 0
-            for i, unique in zip(plan.camera_slots, plan.unique_pairs, strict=True):
-                slot = plan.batch.slots[i]
-                dim = TANGENT_DIM[slot.group]
-                values = block.coupling[rows, :, start : start + dim]
-                pieces.append((slot.group, landmark, slot.rows[rows], values, unique))
-                start += dim
-        out, columns = [], []
-        for group in layout.offset:
-            mine = [p for p in pieces if p[0] == group and len(p[2])]
-            if not mine:
-                continue
-            first = min(int(p[2].min()) for p in mine)
-            count = max(int(p[2].max()) for p in mine) - first + 1
-            dim = TANGENT_DIM[group]
-            dense = np.zeros((len(chunk), count, 3, dim))
-            for _, landmark, rows, values, unique in mine:
-                _add_blocks(dense, landmark, rows - first, values, unique)
-            out.append(np.swapaxes(dense, 1, 2).reshape(len(chunk), 3, count * dim))
-            columns.append(layout.columns(group, np.arange(first, first + count)).reshape(-1))
-        if not out:
-            return np.zeros((len(chunk), 3, 0)), np.zeros(0, dtype=np.int64)
-        return np.concatenate(out, axis=2), np.concatenate(columns)
+        transposed = np.swapaxes(inverse_factor, 1, 2)
+        whitened = np.empty((width, count, 3))
+        start = 0
+        for coupling in block.coupling:
+            stop = start + coupling.shape[1]
+            whitened[start:stop] = np.swapaxes(coupling @ transposed, 0, 1)
+            start = stop
+        flat = whitened.reshape(width, 3 * count)
+        gradient = (inverse_factor @ block.point_gradient[:, :, None]).reshape(-1)
+        return inverse_factor, flat @ flat.T, flat @ gradient
 
     def solve(self, damping: float) -> Step | None:
         """Eliminate, solve the cameras, back-substitute the landmarks; None if not positive definite."""
         reduced = self.reduced(damping)
         if reduced is None:
             return None
-        schur, rhs, inverse_factor = reduced
+        schur, rhs, factors = reduced
         layout, free = self.objective.layout, self._free
         camera_step = np.zeros(layout.size)
         if len(free):
             try:
-                factor = scipy.linalg.cho_factor(schur[np.ix_(free, free)], lower=True, check_finite=False)
+                with one_blas_thread():  # a second thread costs more than it gains at this size
+                    factor = scipy.linalg.cho_factor(schur[np.ix_(free, free)], lower=True, check_finite=False)
             except np.linalg.LinAlgError:
                 return None
             camera_step[free] = scipy.linalg.cho_solve(factor, rhs[free], check_finite=False)
-        point_step = self._back_substitute(camera_step, inverse_factor)
         delta = layout.split(camera_step)
         if self.objective.eliminate is not None:
-            delta[self.objective.eliminate] = point_step
+            delta[self.objective.eliminate] = self._back_substitute(camera_step, factors)
         if not all(np.isfinite(step).all() for step in delta.values()):
             return None
-        return Step(delta, *self._step_size(camera_step, point_step, damping))
+        return Step(delta, *self._step_size(camera_step, delta, damping))
 
-    def _back_substitute(self, camera_step: FloatArray, inverse_factor: FloatArray) -> FloatArray:
-        rhs = self.point_gradient.copy()
-        count = len(rhs)
-        for plan, block in zip(self.objective.plans, self.blocks, strict=True):
-            if block is None or plan.landmark_slot is None:
+    def _back_substitute(self, camera_step: FloatArray, factors: list[FloatArray]) -> FloatArray:
+        """Return d_l = -V^{-1} (g_l + E^T d_c), (N, 3); zero for frozen landmarks."""
+        step = np.zeros((self.objective.num_landmarks, 3))
+        for chunk, block, factor in zip(self.objective.chunks, self.blocks, factors, strict=True):
+            if len(chunk.landmarks) == 0:
                 continue
-            run = np.repeat(np.arange(len(plan.columns)), np.diff(plan.group_start))
-            moved = np.einsum("nad,nd->na", block.coupling, camera_step[plan.columns][run])
-            rows = plan.batch.slots[plan.landmark_slot].rows
-            for a in range(3):
-                rhs[:, a] += np.bincount(rows, moved[:, a], count)
-        half = inverse_factor @ rhs[:, :, None]
-        step = -(np.swapaxes(inverse_factor, 1, 2) @ half)[:, :, 0]
-        step[~self.objective.landmark_free] = 0.0
+            moved, start = block.point_gradient.copy(), 0
+            for coupling in block.coupling:
+                stop = start + coupling.shape[1]
+                moved += camera_step[block.span_columns[start:stop]] @ coupling
+                start = stop
+            half = factor @ moved[:, :, None]
+            step[chunk.landmarks] = -(np.swapaxes(factor, 1, 2) @ half)[:, :, 0]
         return step
 
-    def _step_size(self, camera: FloatArray, point: FloatArray, damping: float) -> tuple[float, float]:
+    def _step_size(self, camera: FloatArray, delta: dict[str, FloatArray], damping: float) -> tuple[float, float]:
         """Return the step's norm and the model's decrease, (-g.d + damping d.D.d) / 2."""
         index = np.arange(3)
-        point_diagonal = self._clamped(self.point_hessian[:, index, index])
-        damped = np.sum(self._clamped(np.diag(self.hessian)) * camera**2) + np.sum(point_diagonal * point**2)
-        slope = -(self.gradient @ camera) - np.sum(self.point_gradient * point)
-        norm = float(np.sqrt(np.sum(camera**2) + np.sum(point**2)))
-        return norm, float(0.5 * (slope + damping * damped))
-
-
-def _rows_of(plan: _BatchPlan, landmarks: IntArray) -> IntArray:
-    """Return the batch rows of the given landmarks."""
-    start, end = plan.landmark_start[landmarks], plan.landmark_start[landmarks + 1]
-    lengths = end - start
-    offsets = np.repeat(start - np.r_[0, np.cumsum(lengths)[:-1]], lengths)
-    result: IntArray = plan.by_landmark[offsets + np.arange(int(lengths.sum()))]
-    return result
-
-
-def _pairs_are_unique(batch: FactorBatch, camera_slot: int, landmark_slots: list[int]) -> bool:
-    if not landmark_slots:
-        return True
-    camera, landmark = batch.slots[camera_slot].rows, batch.slots[landmark_slots[0]].rows
-    pair = landmark * (int(camera.max(initial=0)) + 1) + camera
-    return len(np.unique(pair)) == len(pair)
-
-
-def _add_blocks(dense: FloatArray, landmark: IntArray, rows: IntArray, values: FloatArray, unique: bool) -> None:
-    """Add (n, 3, dim) blocks into dense[landmark, row]; pairs may repeat (shared intrinsics do)."""
-    if unique:
-        dense[landmark, rows] += values
-    elif dense.shape[1] == 1:
-        flat = values.reshape(len(values), -1)
-        summed = np.stack([np.bincount(landmark, flat[:, j], len(dense)) for j in range(flat.shape[1])], axis=1)
-        dense[:, 0] += summed.reshape(len(dense), *values.shape[1:])
-    else:
-        np.add.at(dense, (landmark, rows), values)
+        slope = -(self.gradient @ camera)
+        damped = np.sum(self._clamped(np.diag(self.hessian)) * camera**2)
+        squared = camera @ camera
+        for chunk, block in zip(self.objective.chunks, self.blocks, strict=True):
+            if len(chunk.landmarks):
+                assert self.objective.eliminate is not None
+                point = delta[self.objective.eliminate][chunk.landmarks]
+                slope -= np.sum(block.point_gradient * point)
+                damped += np.sum(self._clamped(block.point_hessian[:, index, index]) * point**2)
+                squared += np.sum(point**2)
+        return float(np.sqrt(squared)), float(0.5 * (slope + damping * damped))

@@ -1,0 +1,329 @@
+"""Stage 2: bundle adjustment of poses, intrinsics, depth scales and landmarks.
+
+Landmarks start at the mean lift of their depth cues. With the MAP energy a first solve uses the configured
+sigmas; observations that disagree are dropped, the noise of reprojection and of depth is measured on what
+stays, and a second solve uses it. Frame 0's pose is the gauge; the depth prior (or, without it, the distance
+of the two farthest cameras) holds the scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.stages import BundleAdjustmentConfig
+from uni4d_fg.errors import DegenerateProblemError
+from uni4d_fg.factors.batch import FactorBatch, Slot
+from uni4d_fg.factors.depth_prior import STATIC_DEPTH_PRIOR
+from uni4d_fg.factors.priors import LOG_SCALE_PRIOR, SCALE_ANCHOR
+from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
+from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.graph.state import State, VariableNames
+from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.summary import SolveSummary, Termination
+from uni4d_fg.stages.lifting import lift, mean_per_row
+from uni4d_fg.stages.noise import robust_sigma
+from uni4d_fg.stages.observations import Normalization, Observations, reprojection_weights
+from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
+from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_prior
+
+
+@dataclass(frozen=True)
+class StaticNoise:
+    """Noise of the static scene: what dynamic points are then judged by."""
+
+    reprojection_sigma_px: float
+    depth_sigma: float
+
+
+@dataclass(frozen=True)
+class BundleAdjustmentResult:
+    """The static scene at the end of stage 2."""
+
+    world_T_cam: FloatArray
+    """(T, 4, 4)."""
+    intrinsics: FloatArray
+    """(4,)."""
+    log_scale: FloatArray
+    """(T,)."""
+    landmarks: FloatArray
+    """(N, 3)."""
+    landmark_track: IntArray
+    """(N,)."""
+    observations: Observations
+    """Observations of the kept landmarks."""
+    noise: StaticNoise
+    solves: list[SolveSummary] = field(default_factory=list)
+    dropped: dict[str, int] = field(default_factory=dict)
+    """Number of observations or landmarks dropped, per reason."""
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """What stage 2 may move besides landmarks."""
+
+    poses: bool
+    intrinsics: bool
+
+
+def bundle_adjustment_stage(
+    state: State,
+    observations: Observations,
+    noise: StaticNoise,
+    config: BundleAdjustmentConfig,
+    prior_intrinsics: FloatArray,
+    freedom: Freedom,
+    *,
+    unsquared: bool,
+    normalization: Normalization,
+) -> Stage:
+    """Declare one solve.
+
+    Args:
+        state: Poses (T), intrinsics, log-scales and landmarks (rows named by track).
+        observations: Observations of exactly those landmarks.
+        noise: Sigmas of the MAP energy.
+        config: Stage 2.
+        prior_intrinsics: (1, 4) centre of the intrinsics' prior.
+        freedom: What is free besides landmarks and log-scales.
+        unsquared: The paper's energy (mean or summed norms) instead of the MAP estimate.
+        normalization: Weights of the paper's energy.
+    """
+    num_frames = len(state["pose"])
+    _, row = observations.rows()
+    slots = (Slot("pose", observations.frame), Slot("landmark", row), Slot("intrinsics", np.zeros_like(row)))
+    weight = observations.weight
+    if unsquared:
+        weight = reprojection_weights(observations.frame, weight, num_frames, normalization)
+    batches = [
+        FactorBatch.create(
+            STATIC_REPROJECTION,
+            slots,
+            {"uv": observations.uv},
+            sigma=1.0 if unsquared else noise.reprojection_sigma_px,
+            weight=weight,
+            kernel=kernel_of(config.reprojection_kernel),
+        )
+    ]
+    batches += camera_motion_terms(np.arange(num_frames), config.camera_motion, unsquared)
+    free: dict[str, BoolArray] = {"landmark": np.ones((len(state["landmark"]), 3), dtype=bool)}
+    if freedom.poses:
+        free["pose"] = np.ones((num_frames, 6), dtype=bool)
+        free["pose"][0] = False
+    if freedom.intrinsics:
+        centre = config.free_principal_point
+        free["intrinsics"] = np.array([[True, True, centre, centre]])
+        if not unsquared:
+            batches.append(intrinsics_prior(prior_intrinsics, config.focal_prior_fraction))
+    if config.depth_prior:
+        free["log_scale"] = np.ones((num_frames, 1), dtype=bool)
+        batches += depth_prior_terms(observations, row, noise.depth_sigma, num_frames, config)
+    elif freedom.poses:
+        batches += scale_anchor(state["pose"])
+    return Stage("bundle_adjustment", tuple(batches), free, config.solver, "schur", eliminate="landmark")
+
+
+def depth_prior_terms(
+    observations: Observations, row: IntArray, sigma: float, num_frames: int, config: BundleAdjustmentConfig
+) -> list[FactorBatch]:
+    """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales."""
+    known = np.isfinite(observations.depth)
+    with_depth = observations.select(known)
+    slots = (Slot("pose", with_depth.frame), Slot("landmark", row[known]), Slot("log_scale", with_depth.frame))
+    return [
+        FactorBatch.create(
+            STATIC_DEPTH_PRIOR,
+            slots,
+            {"depth": with_depth.depth},
+            sigma=sigma * config.depth_sigma_factor,
+            weight=with_depth.weight,
+            kernel=kernel_of(config.depth_kernel),
+        ),
+        FactorBatch.create(
+            LOG_SCALE_PRIOR,
+            (Slot("log_scale", np.arange(num_frames)),),
+            {"measured": np.zeros((num_frames, 1))},
+            sigma=config.depth_scale_prior_sigma,
+        ),
+    ]
+
+
+def scale_anchor(world_T_cam: FloatArray) -> list[FactorBatch]:
+    """Hold the distance between frame 0 and the camera farthest from it; empty for a camera at rest."""
+    distance = np.linalg.norm(world_T_cam[:, :3, 3] - world_T_cam[0, :3, 3], axis=1)
+    farthest = int(np.argmax(distance))
+    if distance[farthest] < 1e-6:
+        return []
+    slots = (Slot("pose", np.zeros(1, dtype=np.int64)), Slot("pose", np.array([farthest])))
+    return [FactorBatch.create(SCALE_ANCHOR, slots, {"distance": distance[[farthest]]}, sigma=1e-3)]
+
+
+def adjust_bundle(
+    observations: Observations,
+    world_T_cam: FloatArray,
+    intrinsics: FloatArray,
+    prior_intrinsics: FloatArray,
+    config: BundleAdjustmentConfig,
+    freedom: Freedom,
+    *,
+    unsquared: bool,
+    normalization: Normalization,
+    hooks: Hooks | None = None,
+) -> BundleAdjustmentResult:
+    """Run stage 2 from the poses and intrinsics of stage 1.
+
+    Args:
+        observations: Trusted observations of static tracks.
+        world_T_cam: (T, 4, 4) starting poses.
+        intrinsics: (4,) starting intrinsics.
+        prior_intrinsics: (4,) the sequence's own intrinsics.
+        config: Stage 2.
+        freedom: Whether poses and intrinsics move.
+        unsquared: The paper's energy instead of the MAP estimate.
+        normalization: Weights of the paper's energy.
+        hooks: Progress and cancellation.
+
+    Raises:
+        DegenerateProblemError: If no static track can be lifted.
+        SolverError: If the system is singular or a cue is not finite.
+    """
+    num_frames = len(world_T_cam)
+    dropped: dict[str, int] = {}
+    zero_scale = np.zeros(num_frames)
+    observations, landmarks = _liftable(observations, world_T_cam, intrinsics, config, dropped)
+    if len(observations) == 0:
+        raise DegenerateProblemError(
+            "bundle adjustment: no static track has depth in any frame and is seen in "
+            f"{config.min_observations} frames. Check masks and depth with 'uni4d-fg validate'."
+        )
+    state = _make_state(world_T_cam, intrinsics, zero_scale, landmarks, observations)
+    noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma)
+    solves: list[SolveSummary] = []
+    rounds = 1 if unsquared or not config.measure_noise else 2
+    for index in range(rounds):
+        stage = bundle_adjustment_stage(
+            state, observations, noise, config, prior_intrinsics[None], freedom,
+            unsquared=unsquared, normalization=normalization,
+        )  # fmt: skip
+        state, summary = run_stage(stage, state, hooks)
+        solves.append(summary)
+        if summary.termination is Termination.CANCELLED:
+            break
+        state, observations = _drop_outliers(state, observations, config, dropped)
+        noise = _measure(state, observations, noise, config)
+        if len(observations) == 0:
+            raise DegenerateProblemError(
+                f"bundle adjustment: every observation was dropped as an outlier in round {index + 1} "
+                f"(limit {config.max_reprojection_px} px); are the intrinsics or the masks wrong?"
+            )
+    landmarks = state["landmark"]
+    if config.relift:
+        tracks, row = observations.rows()
+        points = lift(observations, state["pose"], state["intrinsics"][0], state["log_scale"][:, 0])
+        landmarks = mean_per_row(points, observations.weight, row, len(tracks))
+    track = state.names.landmark_track
+    assert track is not None
+    keep = _spatial_inliers(landmarks, config)
+    dropped["landmark far from its neighbours"] = int((~keep).sum())
+    observations = observations.select(np.isin(observations.track, track[keep]))
+    return BundleAdjustmentResult(
+        state["pose"], state["intrinsics"][0], state["log_scale"][:, 0], landmarks[keep], track[keep],
+        observations, noise, solves, dropped,
+    )  # fmt: skip
+
+
+def _make_state(
+    world_T_cam: FloatArray, intrinsics: FloatArray, log_scale: FloatArray, landmarks: FloatArray, obs: Observations
+) -> State:
+    tracks, _ = obs.rows()
+    groups = {
+        "pose": world_T_cam,
+        "intrinsics": intrinsics.reshape(1, 4),
+        "log_scale": log_scale.reshape(-1, 1),
+        "landmark": landmarks,
+    }
+    return State(groups, VariableNames(landmark_track=tracks))
+
+
+def _liftable(
+    observations: Observations,
+    world_T_cam: FloatArray,
+    intrinsics: FloatArray,
+    config: BundleAdjustmentConfig,
+    dropped: dict[str, int],
+) -> tuple[Observations, FloatArray]:
+    """Keep tracks that are long enough and have depth; return them with their starting landmarks."""
+    before = len(np.unique(observations.track))
+    observations = observations.with_min_observations(min(config.min_observations, len(world_T_cam)))
+    tracks, row = observations.rows()
+    dropped["track with too few observations"] = before - len(tracks)
+    points = lift(observations, world_T_cam, intrinsics, np.zeros(len(world_T_cam)))
+    landmarks = mean_per_row(points, observations.weight, row, len(tracks))
+    known = np.asarray(np.isfinite(landmarks).all(axis=1))
+    dropped["track without depth"] = int((~known).sum())
+    return observations.select(known[row]), landmarks[known]
+
+
+def _drop_outliers(
+    state: State, observations: Observations, config: BundleAdjustmentConfig, dropped: dict[str, int]
+) -> tuple[State, Observations]:
+    """Drop observations behind the camera, too far off, or of landmarks whose depth contradicts the cue."""
+    tracks, row = observations.rows()
+    z = world_to_camera(state["pose"][observations.frame], state["landmark"][row])[:, 2]
+    residual = STATIC_REPROJECTION.residual(
+        state["pose"][observations.frame], state["landmark"][row], state["intrinsics"][[0] * len(row)],
+        uv=observations.uv,
+    )  # fmt: skip
+    behind = z <= NEAR_PLANE
+    far = ~behind & (np.linalg.norm(residual, axis=1) > config.max_reprojection_px)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.abs(
+            np.log(np.maximum(z, NEAR_PLANE) / observations.depth) - state["log_scale"][observations.frame, 0]
+        )
+    known = np.isfinite(ratio)
+    wrong = np.bincount(row[known], ratio[known] > np.log(config.max_depth_ratio), len(tracks))
+    contradicted = (wrong > 0.5 * np.bincount(row[known], minlength=len(tracks))) & (wrong > 0)
+    keep = ~(behind | far | contradicted[row])
+    kept = observations.select(keep).with_min_observations(min(config.min_observations, len(state["pose"])))
+    stays = np.isin(tracks, kept.track)
+    for reason, count in (
+        ("observation behind the camera", int(behind.sum())),
+        ("observation with a large reprojection error", int(far.sum())),
+        ("landmark whose depth contradicts the cue", int(contradicted.sum())),
+        ("landmark left with too few observations", int((~stays & ~contradicted).sum())),
+    ):
+        dropped[reason] = dropped.get(reason, 0) + count
+    names = VariableNames(landmark_track=tracks[stays])
+    return State({**state.groups, "landmark": state["landmark"][stays]}, names), kept
+
+
+def _measure(
+    state: State, observations: Observations, noise: StaticNoise, config: BundleAdjustmentConfig
+) -> StaticNoise:
+    """Measure the noise of the static scene from what is left."""
+    _, row = observations.rows()
+    pose, landmark = state["pose"][observations.frame], state["landmark"][row]
+    reprojection = STATIC_REPROJECTION.residual(pose, landmark, state["intrinsics"][[0] * len(row)], uv=observations.uv)
+    known = np.isfinite(observations.depth)
+    depth = STATIC_DEPTH_PRIOR.residual(
+        pose[known], landmark[known], state["log_scale"][observations.frame[known]], depth=observations.depth[known]
+    )
+    pixel, relative = robust_sigma(reprojection), robust_sigma(depth)
+    return StaticNoise(
+        max(pixel * config.reprojection_sigma_factor, config.min_reprojection_sigma_px),
+        max(relative, config.min_depth_sigma) if np.isfinite(relative) else noise.depth_sigma,
+    )
+
+
+def _spatial_inliers(landmarks: FloatArray, config: BundleAdjustmentConfig) -> BoolArray:
+    """Return which landmarks are not isolated: mean squared distance to 5 neighbours below the quantile rule."""
+    if len(landmarks) < 7:
+        return np.ones(len(landmarks), dtype=bool)
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(landmarks).query(landmarks, k=6)
+    score = np.mean(distance[:, 1:] ** 2, axis=1)
+    result: BoolArray = score <= config.outlier_factor * np.quantile(score, config.outlier_quantile)
+    return result

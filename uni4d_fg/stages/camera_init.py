@@ -1,0 +1,184 @@
+"""Stage 1: camera initialisation by depth reprojection over a sliding window.
+
+Frames enter one by one. Each window holds the newest ``window`` frames; its poses (and, if free, the focal
+lengths) are solved against the depth reprojection of every ordered pair of its frames. Once the window has
+slid, its oldest frame is held fixed, so that it stays attached to everything before it; frame 0 always is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.stages import CameraInitConfig
+from uni4d_fg.errors import DegenerateProblemError
+from uni4d_fg.factors.batch import FactorBatch, Slot
+from uni4d_fg.factors.depth_reprojection import DEPTH_REPROJECTION
+from uni4d_fg.geometry import se3
+from uni4d_fg.graph.state import State
+from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.summary import SolveSummary, Termination
+from uni4d_fg.stages.observations import Normalization
+from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
+from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_prior
+from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
+
+
+@dataclass(frozen=True)
+class CameraInitResult:
+    """Poses and intrinsics at the end of stage 1."""
+
+    world_T_cam: FloatArray
+    """(T, 4, 4)."""
+    intrinsics: FloatArray
+    """(4,)."""
+    windows: list[SolveSummary] = field(default_factory=list)
+    bridged_frames: tuple[int, ...] = ()
+    """Frames with too few tracks: posed by constant velocity."""
+
+
+class PairSource:
+    """The depth reprojection factors of frame pairs, made once and reused by every window that holds them."""
+
+    def __init__(self, labelled: LabelledTracks, max_tracks: int):
+        keep = labelled.label == int(TrackLabel.STATIC)
+        self.uv = labelled.tracks.uv[keep].astype(np.float64)
+        self.depth = labelled.depth[keep].astype(np.float64)
+        self.weight = labelled.weight[keep].astype(np.float64)
+        self.seen: BoolArray = self.weight > 0
+        self.liftable: BoolArray = self.seen & np.isfinite(self.depth)
+        self.max_tracks = max_tracks
+        self._tracks: dict[tuple[int, int], IntArray] = {}
+
+    def tracks(self, source: int, target: int) -> IntArray:
+        """Return the tracks liftable in ``source`` and seen in ``target``, thinned evenly."""
+        if (source, target) not in self._tracks:
+            common = np.flatnonzero(self.liftable[:, source] & self.seen[:, target])
+            if self.max_tracks and len(common) > self.max_tracks:
+                common = common[np.linspace(0, len(common) - 1, self.max_tracks).astype(np.int64)]
+            self._tracks[source, target] = common
+        return self._tracks[source, target]
+
+    def forget_before(self, frame: int) -> None:
+        """Drop cached pairs whose frames have left the window."""
+        self._tracks = {pair: tracks for pair, tracks in self._tracks.items() if min(pair) >= frame}
+
+    def batch(
+        self, pairs: list[tuple[int, int]], config: CameraInitConfig, unsquared: bool, normalization: Normalization
+    ) -> FactorBatch:
+        """Return the factors of ordered frame pairs (source, target)."""
+        tracks = [self.tracks(i, j) for i, j in pairs]
+        k = np.concatenate([np.zeros(0, dtype=np.int64), *tracks])
+        counts = np.array([len(t) for t in tracks], dtype=np.int64)
+        source = np.repeat(np.array([i for i, _ in pairs], dtype=np.int64), counts)
+        target = np.repeat(np.array([j for _, j in pairs], dtype=np.int64), counts)
+        weight = np.sqrt(self.weight[k, source] * self.weight[k, target])
+        if unsquared and normalization == "mean":
+            pair_of_row = np.repeat(np.arange(len(pairs)), counts)
+            weight /= len(pairs) * np.bincount(pair_of_row, weight, len(pairs))[pair_of_row]
+        return FactorBatch.create(
+            DEPTH_REPROJECTION,
+            (Slot("pose", source), Slot("pose", target), Slot("intrinsics", np.zeros(len(k), dtype=np.int64))),
+            {"uv_source": self.uv[k, source], "depth": self.depth[k, source], "uv_target": self.uv[k, target]},
+            sigma=1.0 if unsquared else config.reprojection_sigma_px,
+            weight=weight,
+            kernel=kernel_of(config.kernel),
+        )
+
+
+def window_stage(
+    frames: IntArray,
+    state: State,
+    pairs: PairSource,
+    config: CameraInitConfig,
+    *,
+    free_intrinsics: bool,
+    unsquared: bool,
+    normalization: Normalization,
+) -> Stage:
+    """Declare the solve of one window.
+
+    Args:
+        frames: (W,) ascending frames of the window.
+        state: Poses, intrinsics.
+        pairs: Source of the factors.
+        config: Stage 1.
+        free_intrinsics: Whether the focal lengths move.
+        unsquared: The paper's energy instead of the MAP estimate.
+        normalization: Weights of the paper's energy.
+    """
+    ordered = [(i, j) for i in frames.tolist() for j in frames.tolist() if i != j]
+    batches = [pairs.batch(ordered, config, unsquared, normalization)]
+    batches += camera_motion_terms(frames, config.camera_motion, unsquared)
+    free_pose = np.zeros((len(state["pose"]), 6), dtype=bool)
+    free_pose[frames[1:]] = True
+    free = {"pose": free_pose}
+    if free_intrinsics:
+        free["intrinsics"] = np.array([[True, True, False, False]])
+        if not unsquared:
+            batches.append(intrinsics_prior(state["intrinsics"], config.focal_prior_fraction))
+    return Stage(f"camera_init[{frames[0]}-{frames[-1]}]", tuple(batches), free, config.solver)
+
+
+def initialize_cameras(
+    labelled: LabelledTracks,
+    intrinsics: FloatArray,
+    config: CameraInitConfig,
+    *,
+    free_intrinsics: bool,
+    unsquared: bool,
+    normalization: Normalization,
+    hooks: Hooks | None = None,
+) -> CameraInitResult:
+    """Estimate all poses (frame 0 is the world) and, if free, the focal lengths.
+
+    Raises:
+        DegenerateProblemError: If no frame pair shares enough static tracks with depth.
+        SolverError: If a window cannot be solved.
+    """
+    num_frames = labelled.tracks.num_frames
+    state = State({"pose": np.tile(np.eye(4), (num_frames, 1, 1)), "intrinsics": intrinsics[None].copy()})
+    prior_intrinsics = state["intrinsics"].copy()
+    pairs = PairSource(labelled, config.max_tracks_per_pair)
+    summaries: list[SolveSummary] = []
+    bridged: list[int] = []
+    for newest in range(1, num_frames):
+        frames = np.arange(max(0, newest - config.window + 1), newest + 1)
+        poses = state["pose"].copy()
+        poses[newest] = _predict(poses, newest)
+        state = state.replace(pose=poses)
+        shared = sum(len(pairs.tracks(i, newest)) + len(pairs.tracks(newest, i)) for i in frames[:-1].tolist())
+        if shared < 2 * config.min_tracks_per_frame:
+            bridged.append(newest)
+            continue
+        stage = window_stage(
+            frames,
+            state.replace(intrinsics=prior_intrinsics),
+            pairs,
+            config,
+            free_intrinsics=free_intrinsics and newest >= config.window - 1,
+            unsquared=unsquared,
+            normalization=normalization,
+        )
+        state, summary = run_stage(stage, state, hooks)
+        summaries.append(summary)
+        pairs.forget_before(int(frames[0]))
+        if summary.termination is Termination.CANCELLED:
+            break
+    if num_frames > 1 and not summaries:
+        raise DegenerateProblemError(
+            "camera initialisation: no two frames share "
+            f"{config.min_tracks_per_frame} static tracks with depth. Check masks (is everything marked as moving?), "
+            "depth (is it zero or missing?) and tracks; 'uni4d-fg validate' lists what was found."
+        )
+    return CameraInitResult(state["pose"], state["intrinsics"][0], summaries, tuple(bridged))
+
+
+def _predict(poses: FloatArray, frame: int) -> FloatArray:
+    """Continue the last relative motion (constant velocity)."""
+    if frame < 2:
+        return np.asarray(poses[frame - 1])
+    step = se3.inverse(poses[frame - 2]) @ poses[frame - 1]
+    return se3.orthonormalize(poses[frame - 1] @ step)

@@ -1,0 +1,80 @@
+"""Track observations as flat arrays, and the weights of the paper's normalisations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
+
+Normalization = Literal["mean", "sum"]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N observations, sorted by track and then by frame."""
+
+    track: IntArray
+    """(N,) index in the labelled tracks."""
+    frame: IntArray
+    """(N,)."""
+    uv: FloatArray
+    """(N, 2) px."""
+    depth: FloatArray
+    """(N,) depth cue, m; NaN where missing."""
+    weight: FloatArray
+    """(N,) in (0, 1]."""
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+    def select(self, keep: BoolArray | IntArray) -> Observations:
+        """Return the observations picked by a mask or by indices."""
+        return Observations(self.track[keep], self.frame[keep], self.uv[keep], self.depth[keep], self.weight[keep])
+
+    def with_min_observations(self, count: int) -> Observations:
+        """Drop the observations of tracks that have fewer than ``count``."""
+        if len(self) == 0:
+            return self
+        return self.select(np.bincount(self.track)[self.track] >= count)
+
+    def rows(self) -> tuple[IntArray, IntArray]:
+        """Return the distinct tracks (M,), ascending, and the row of each observation among them (N,)."""
+        tracks, row = np.unique(self.track, return_inverse=True)
+        return tracks, row.astype(np.int64)
+
+
+def observations_of(labelled: LabelledTracks, *labels: TrackLabel) -> Observations:
+    """Collect the trusted observations (weight > 0) of all tracks with one of the labels."""
+    wanted = np.isin(labelled.label, [int(label) for label in labels])
+    track, frame = np.nonzero((labelled.weight > 0) & wanted[:, None])
+    return Observations(
+        track.astype(np.int64),
+        frame.astype(np.int64),
+        labelled.tracks.uv[track, frame].astype(np.float64),
+        labelled.depth[track, frame].astype(np.float64),
+        labelled.weight[track, frame].astype(np.float64),
+    )
+
+
+def reprojection_weights(frame: IntArray, weight: FloatArray, num_frames: int, kind: Normalization) -> FloatArray:
+    """Weight reprojection rows as the paper does.
+
+    Args:
+        frame: (N,) frame of each row.
+        weight: (N,) trust of each row.
+        num_frames: T.
+        kind: 'mean' gives ``w / (T sum_of_w_in_frame)``: the mean over frames of per-frame means (reference
+            program); 'sum' gives ``w`` (paper's text).
+
+    Returns:
+        (N,) weights.
+    """
+    if kind == "sum":
+        return weight
+    per_frame = np.bincount(frame, weight, num_frames)
+    result: FloatArray = weight / (num_frames * np.maximum(per_frame[frame], 1e-16))
+    return result

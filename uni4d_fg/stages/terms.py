@@ -1,0 +1,38 @@
+"""Terms that several stages share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.config.stages import CameraMotionConfig
+from uni4d_fg.factors.batch import FactorBatch, Slot
+from uni4d_fg.factors.camera_motion import CAMERA_ROTATION, CAMERA_TRANSLATION
+from uni4d_fg.factors.kernels import Kernel
+from uni4d_fg.factors.priors import INTRINSICS_PRIOR
+
+_NORM_SMOOTHING = 1e-2
+
+
+def camera_motion_terms(frames: IntArray, config: CameraMotionConfig, unsquared: bool) -> list[FactorBatch]:
+    """Return E_rot and E_trans over consecutive ``frames`` (W,); empty when switched off or W < 3."""
+    if config.weight == 0.0 or len(frames) < 3:
+        return []
+    slots = tuple(Slot("pose", frames[i : len(frames) - 2 + i]) for i in range(3))
+    count = len(frames) - 2
+    kernel = Kernel("norm", _NORM_SMOOTHING) if unsquared else Kernel("quadratic")
+    weight = config.weight / count if unsquared else config.weight
+    floors = ((CAMERA_ROTATION, config.rotation_floor_rad), (CAMERA_TRANSLATION, config.translation_floor_m))
+    return [
+        FactorBatch.create(family, slots, {"floor": np.full(count, floor)}, weight=weight, kernel=kernel)
+        for family, floor in floors
+    ]
+
+
+def intrinsics_prior(intrinsics: FloatArray, fraction: float) -> FactorBatch:
+    """Return a prior on the intrinsics (1, 4) whose sigma is a part of the focal lengths."""
+    fx, fy = intrinsics[0, 0], intrinsics[0, 1]
+    sigma = fraction * np.array([[fx, fy, fx, fy]])
+    return FactorBatch.create(
+        INTRINSICS_PRIOR, (Slot("intrinsics", np.zeros(1, dtype=np.int64)),), {"measured": intrinsics}, sigma=sigma
+    )
