@@ -14,7 +14,7 @@ class TrackingConfig(Section):
     grid_rows: int = setting(50, "Query points per column of the grid.", ge=2, le=400)
     query_interval: int = setting(10, "A new grid is started every this many frames.", ge=1)
     margin_px: float = setting(8.0, "Distance of the outermost query points from the image border, px.", ge=0)
-    window_px: int = setting(21, "Side of the Lucas-Kanade window, px (odd).", ge=5, le=101)
+    window_px: int = setting(21, "Side of the Lucas-Kanade window, px.", ge=5, le=101)
     pyramid_levels: int = setting(3, "Pyramid levels above the full image.", ge=0, le=8)
     max_iterations: int = setting(30, "Lucas-Kanade iterations per level.", ge=1)
     convergence_px: float = setting(0.01, "Lucas-Kanade stops when a point moves less than this, px.", gt=0)

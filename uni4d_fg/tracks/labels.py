@@ -126,14 +126,16 @@ def _majority(
     Args:
         found: (K, T) mask id at each observation, negative where unsure or not seen.
     """
-    mask_id = np.full(len(found), UNCERTAIN, np.int32)
     votes = (found >= 0).sum(axis=1)
-    agreeing = np.zeros(len(found), np.int64)
-    for candidate in np.unique(found[found >= 0]):
-        count = (found == candidate).sum(axis=1)
-        better = count > agreeing
-        mask_id[better] = candidate
-        agreeing[better] = count[better]
+    agreeing = (found == _STATIC_ID).sum(axis=1)
+    mask_id = np.where(agreeing > 0, _STATIC_ID, UNCERTAIN).astype(np.int32)
+    on_an_instance = np.flatnonzero(votes > agreeing)
+    elsewhere = found[on_an_instance]
+    for candidate in np.unique(elsewhere[elsewhere > _STATIC_ID]):
+        count = (elsewhere == candidate).sum(axis=1)
+        better = count > agreeing[on_an_instance]
+        mask_id[on_an_instance[better]] = candidate
+        agreeing[on_an_instance[better]] = count[better]
     return mask_id, votes, agreeing
 
 
