@@ -7,6 +7,7 @@ import json
 import math
 import os
 import secrets
+import shutil
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -72,6 +73,34 @@ def atomic_path(path: Path) -> Iterator[Path]:
     finally:
         if temporary.exists():
             temporary.unlink()
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Write a folder so that it appears whole or not at all.
+
+    Args:
+        path: Where the folder shall be: absent, or an empty folder. What is there is never overwritten.
+
+    Yields:
+        A temporary folder beside it. When the block ends normally it is moved to ``path``; when it raises,
+        it is removed with all it holds.
+
+    Raises:
+        OutputError: If ``path`` is in the way, or an ``OSError`` occurs in the block or while moving.
+    """
+    target = Path(os.path.realpath(path))
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise OutputError(f"cannot write {path}: it exists already; remove it or choose another --out")
+    temporary = temporary_sibling(target)
+    try:
+        temporary.mkdir(parents=True)
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        raise write_failure(Path(path), error) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def atomic_write_text(path: Path, text: str) -> None:
