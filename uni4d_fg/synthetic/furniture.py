@@ -8,7 +8,7 @@ from uni4d_fg.synthetic.texture import SurfaceStyle
 ROOM_SIZE_M = (5.0, 3.0, 5.0)
 """Width, height and depth of the room, metres."""
 
-_WALLPAPER = SurfaceStyle((0.62, 0.66, 0.75), (0.85, 0.8, 0.7), "dots", 0.45)
+_WALLPAPER = SurfaceStyle((0.62, 0.66, 0.75), (0.85, 0.8, 0.7), "dots", 0.45, contrast=0.3)
 _SIDE_WALL = SurfaceStyle((0.75, 0.66, 0.55), (0.6, 0.62, 0.6), "stripes", 0.6, (0.4, 0.9, 0.1))
 _FLOOR = SurfaceStyle((0.5, 0.33, 0.2), (0.75, 0.58, 0.4), "checks", 0.5, (1.1, 0.3, 0.8))
 _CEILING = SurfaceStyle((0.85, 0.85, 0.82), (0.65, 0.65, 0.68), "none", 1.0, (0.2, 2.0, 0.7))
@@ -44,5 +44,5 @@ def furnished_room() -> list[tuple[Mesh, SurfaceStyle]]:
         (box((0.24, 0.16, 0.2)).translated((0.72, 0.665, 1.3)), _PAINTING),
         (box((1.1, 0.75, 0.06)).translated((0.2, -0.55, 2.46)), _PAINTING),
         (box((0.4, 0.5, 0.4)).translated((-1.55, -0.05, 1.85)), _SHELF),
-        (sphere(0.3).translated((1.15, 1.2, 0.55)), _CUSHION),
+        (sphere(0.3).translated((1.3, 1.2, 0.65)), _CUSHION),
     ]

@@ -72,7 +72,7 @@ class WobblyMotion:
     """Twist between the two ends, rad."""
     bulge: float = 0.16
     """Relative change of the radius."""
-    frequency_hz: float = 0.6
+    frequency_hz: float = 0.5
     """Oscillations per second; the parts use different multiples of it."""
     phase: float = 0.0
     """Phase at time 0, rad."""

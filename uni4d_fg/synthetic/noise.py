@@ -12,7 +12,8 @@ from uni4d_fg.tracks.model import Tracks
 
 # One independent stream per cue: switching the noise of one off leaves the others as they were.
 _TRACK_STREAM, _DEPTH_STREAM, _MASK_STREAM = 1, 2, 3
-_FIELD_NODES = 6
+# Nodes across a map: the depth error varies over a third of the image, holes are smaller blobs.
+_FIELD_NODES, _HOLE_NODES = 4, 9
 
 
 class CueNoise(Section):
@@ -99,10 +100,10 @@ def _inside(uv: FloatArray | Float32Array, height: int, width: int) -> BoolArray
     return np.asarray((u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1))
 
 
-def _smooth_field(rng: np.random.Generator, height: int, width: int) -> FloatArray:
+def _smooth_field(rng: np.random.Generator, height: int, width: int, nodes: int) -> FloatArray:
     """Return (H, W) low-frequency noise of zero mean and unit deviation."""
-    nodes = rng.standard_normal((_FIELD_NODES, _FIELD_NODES + 2))
-    field = np.asarray(cv2.resize(nodes, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float64)
+    coarse = rng.standard_normal((nodes, nodes + 1))
+    field = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float64)
     spread = float(field.std())
     result: FloatArray = (field - field.mean()) / (spread if spread > 0 else 1.0)
     return result
@@ -125,10 +126,10 @@ def noisy_depths(depths: Float32Array, noise: CueNoise, seed: int) -> tuple[Floa
     flicker = np.asarray(noise.depth_flicker * rng.standard_normal(num_frames))
     cue = np.empty_like(depths)
     for t in range(num_frames):
-        log_error = flicker[t] + noise.depth_field * _smooth_field(rng, height, width)
+        log_error = flicker[t] + noise.depth_field * _smooth_field(rng, height, width, _FIELD_NODES)
         log_error = log_error + noise.depth_pixel * rng.standard_normal((height, width), dtype=np.float32)
         cue[t] = depths[t] * np.exp(log_error)
-        blobs = _smooth_field(rng, height, width)
+        blobs = _smooth_field(rng, height, width, _HOLE_NODES)
         if noise.hole_fraction > 0:
             cue[t][blobs > np.quantile(blobs, 1.0 - noise.hole_fraction)] = np.nan
     return cue, -flicker

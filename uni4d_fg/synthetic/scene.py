@@ -64,45 +64,43 @@ class Scene:
         return np.concatenate([o.motion(o.mesh.vertices, time) for o in self.objects])
 
 
-_RIGID_STYLE = SurfaceStyle((0.85, 0.25, 0.15), (0.95, 0.85, 0.55), "checks", 0.22, (0.3, 1.1, 0.5))
-_DEFORMING_STYLE = SurfaceStyle((0.15, 0.55, 0.25), (0.85, 0.9, 0.3), "stripes", 0.16, (1.7, 0.2, 0.9))
+_RIGID_STYLE = SurfaceStyle((0.85, 0.25, 0.15), (0.95, 0.85, 0.55), "checks", 0.22, (0.3, 1.1, 0.5), 0.7)
+_DEFORMING_STYLE = SurfaceStyle((0.15, 0.6, 0.3), (0.9, 0.9, 0.35), "checks", 0.14, (1.7, 0.2, 0.9), 0.75)
 _DEFORMING_HEIGHT_M = 0.78
-# Where further objects of a kind are put relative to the first, metres.
-_SPREAD = ((0.0, 0.0, 0.0), (-0.55, -0.5, 0.75), (0.5, -0.45, 0.55), (-0.1, 0.35, -0.25))
+_RIGID_CENTRES = ((-0.35, 0.2, 0.15), (-0.9, -0.3, 1.05), (0.25, -0.6, 1.1))
+_DEFORMING_CENTRES = ((0.55, 0.33, 0.45), (1.0, -0.3, 1.2), (-0.3, -0.05, 1.75))
 
-MAX_OBJECTS_PER_KIND = len(_SPREAD)
+MAX_OBJECTS_PER_KIND = len(_RIGID_CENTRES)
 """Most rigid (and most deforming) objects that the room has a place for."""
 
 
 def _rigid_object(index: int) -> SceneObject:
-    x, y, z = _SPREAD[index]
     motion = RigidMotion(
-        centre=(-0.35 + x, 0.2 + y, 0.15 + z),
+        centre=_RIGID_CENTRES[index],
         swing=(0.3, 0.12, 0.2),
         frequency=(0.24, 0.31, 0.2),
         phase=(-0.9 + 1.7 * index, 0.4 + index, 1.0 - index),
         tilt=(0.35, 0.5, 0.1 + index),
         rotation_rate=(0.2, 0.45, 0.15) if index % 2 == 0 else (0.1, -0.4, 0.2),
     )
-    scale = 1.0 if index == 0 else 0.75
+    scale = 1.0 if index == 0 else 0.7
     mesh = box((0.55 * scale, 0.42 * scale, 0.38 * scale))
     return SceneObject(mesh, _RIGID_STYLE, 2 * index + 1, motion)
 
 
 def _deforming_object(index: int) -> SceneObject:
-    x, y, z = _SPREAD[index]
     carrier = RigidMotion(
-        centre=(0.55 - x, 0.35 + y, 0.45 + z),
+        centre=_DEFORMING_CENTRES[index],
         swing=(0.18, 0.05, 0.2),
         frequency=(0.27, 0.4, 0.22),
         phase=(2.6 + 1.3 * index, index, 0.3 + index),
         tilt=(0.0, 0.3, 0.08),
         rotation_rate=(0.0, -0.3, 0.0),
     )
-    scale = 1.0 if index == 0 else 0.75
+    scale = 1.0 if index == 0 else 0.7
     height = scale * _DEFORMING_HEIGHT_M
     motion = WobblyMotion(carrier, height, bend_m=0.14 * scale, wave_m=0.04 * scale, phase=0.5 + index)
-    return SceneObject(capsule(0.16 * scale, height), _DEFORMING_STYLE, 2 * index + 2, motion)
+    return SceneObject(capsule(0.18 * scale, height), _DEFORMING_STYLE, 2 * index + 2, motion)
 
 
 def make_scene(objects: ObjectChoice = "both", objects_per_kind: int = 1) -> Scene:

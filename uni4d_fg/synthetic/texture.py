@@ -31,6 +31,8 @@ class SurfaceStyle:
     """Period of the pattern, metres."""
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Shift in the noise, metres, so that equal shapes differ."""
+    contrast: float = 0.45
+    """Relative amplitude of the fine noise."""
 
 
 def _lattice(cells: int, octave: int) -> Float32Array:
@@ -114,5 +116,5 @@ def reflectance(style: SurfaceStyle, points: FloatArray) -> FloatArray:
     blend = 0.5 + 0.35 * np.tanh(1.2 * coarse) + 0.3 * _pattern(style, points)
     blend = np.clip(blend, 0.0, 1.0)[:, None]
     colour = (1.0 - blend) * np.asarray(style.first) + blend * np.asarray(style.second)
-    result: FloatArray = np.clip(colour * (1.0 + 0.45 * np.tanh(0.9 * fine))[:, None], 0.0, 1.0)
+    result: FloatArray = np.clip(colour * (1.0 + style.contrast * np.tanh(0.9 * fine))[:, None], 0.0, 1.0)
     return result
