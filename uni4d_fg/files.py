@@ -99,6 +99,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         os.replace(temporary, target)
     except OSError as error:
         raise write_failure(Path(path), error) from error
+    except OutputError as error:
+        raise OutputError(str(error).replace(str(temporary), str(path))) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

@@ -58,8 +58,11 @@ def check_pairing(item: str, stems: list[str], image_stems: list[str], findings:
     own, images = frame_numbers(stems), frame_numbers(image_stems)
     if own is None or images is None or any("." in stem for stem in (*stems, *image_stems)):
         return
-    if len(set((np.array(own) - np.array(images)).tolist())) > 1:
-        at = next(i for i in range(len(own)) if own[i] - images[i] != own[0] - images[0])
+    offsets = np.array(own) - np.array(images)
+    # A constant offset is another way of counting, unless both count alike and a file lacks at one end.
+    renumbered = (offsets == offsets[0]).all() and set(own).isdisjoint(images)
+    if (offsets != 0).any() and not renumbered:
+        at = int(np.flatnonzero(offsets)[0])
         findings.add(
             "warning",
             item,
