@@ -90,7 +90,14 @@ def test_noise_is_normalised_periodic_and_detailed() -> None:
 
 @pytest.mark.parametrize(
     "fields",
-    [{"num_frames": 0}, {"path": "orbit"}, {"objects": "many"}, {"margin_px": 130.0}, {"colour": 1}],
+    [
+        {"num_frames": 0},
+        {"path": "orbit"},
+        {"objects": "many"},
+        {"margin_px": 130.0},
+        {"noise": {"outlier_min_px": 30}},
+        {"colour": 1},
+    ],
 )
 def test_impossible_configurations_are_refused(fields: dict[str, object]) -> None:
     with pytest.raises(ValidationError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from pydantic import model_validator
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.base import Section, setting
@@ -42,6 +43,12 @@ class CueNoise(Section):
     focal_error: float = setting(
         0.05, "Relative error of the sequence's focal lengths: 0.05 gives them 5 % too long.", gt=-0.9, le=1
     )
+
+    @model_validator(mode="after")
+    def _outlier_range_is_ordered(self) -> CueNoise:
+        if self.outlier_min_px > self.outlier_max_px:
+            raise ValueError(f"outlier_min_px {self.outlier_min_px:g} exceeds {self.outlier_max_px:g}")
+        return self
 
     @classmethod
     def none(cls) -> CueNoise:
