@@ -37,7 +37,8 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
     cloud = open3d.t.geometry.PointCloud()
     cloud.point.positions = open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
     cloud.point.colors = open3d.core.Tensor(np.ascontiguousarray(colors, dtype=np.uint8))
-    with atomic_path(path) as temporary:
+    quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
+    with atomic_path(path) as temporary, quiet:
         if not open3d.t.io.write_point_cloud(str(temporary), cloud):
             raise OutputError(f"cannot write {path}: Open3D failed; check free space and the folder's permissions")
 

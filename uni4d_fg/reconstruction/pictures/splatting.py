@@ -1,0 +1,117 @@
+"""A small point renderer in NumPy: a depth buffer, discs of the points' own size, and soft edge shading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, ImageArray
+from uni4d_fg.geometry.camera import project, world_to_camera
+
+_MAX_RADIUS_PX = 6
+_NEAR_M = 1e-3
+_EDGE_STRENGTH = 2.2
+
+
+@dataclass(frozen=True)
+class View:
+    """A virtual camera."""
+
+    world_T_cam: FloatArray
+    """(4, 4) camera to world, OpenCV axes."""
+    intrinsics: FloatArray
+    """(4,) fx, fy, cx, cy, px."""
+    image_size: tuple[int, int]
+    """(height, width), px."""
+
+    def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return pixels (..., 2) and depths (...) of world points (..., 3); NaN behind the camera."""
+        camera = world_to_camera(self.world_T_cam, points)
+        depth = np.where(camera[..., 2] > _NEAR_M, camera[..., 2], np.nan)
+        camera = np.where(np.isfinite(depth)[..., None], camera, np.nan)
+        return project(self.intrinsics, camera), depth
+
+    def scaled(self, factor: int) -> View:
+        """Return the same view with ``factor`` times the pixels in each direction."""
+        height, width = self.image_size
+        fx, fy, cx, cy = self.intrinsics * factor
+        half = 0.5 * (factor - 1)
+        return View(self.world_T_cam, np.array([fx, fy, cx + half, cy + half]), (height * factor, width * factor))
+
+
+def look_at(eye: FloatArray, target: FloatArray, up: FloatArray) -> FloatArray:
+    """Return the pose (4, 4) of a camera at ``eye`` that looks at ``target``, with ``up`` upwards."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack((right, np.cross(forward, right), forward), axis=1)
+    pose[:3, 3] = eye
+    return pose
+
+
+def render(
+    view: View, points: FloatArray, colors: ImageArray, point_size_m: FloatArray, background: tuple[int, int, int]
+) -> tuple[ImageArray, FloatArray]:
+    """Render a cloud, drawn at twice the resolution and averaged down.
+
+    Args:
+        view: Virtual camera.
+        points: (N, 3) world positions, metres.
+        colors: (N, 3) RGB.
+        point_size_m: (N,) diameter of each point, metres.
+        background: RGB where there is no point.
+
+    Returns:
+        Image (H, W, 3) and depth (H, W), metres, infinite where there is no point.
+    """
+    fine = view.scaled(2)
+    color, depth = _splat(fine, points, colors, point_size_m)
+    shade = _edge_shading(depth)
+    image = np.where(np.isfinite(depth)[..., None], color * shade[..., None], np.array(background, dtype=np.float64))
+    height, width = view.image_size
+    image = image.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8), depth.reshape(height, 2, width, 2).min(axis=(1, 3))
+
+
+def _splat(
+    view: View, points: FloatArray, colors: ImageArray, point_size_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return colour (H, W, 3) and depth (H, W) of the nearest disc in each pixel."""
+    height, width = view.image_size
+    uv, z = view.project(points)
+    column, row = np.rint(np.nan_to_num(uv, nan=-1e6)).clip(-1e6, 1e6).astype(np.int64).T
+    margin = _MAX_RADIUS_PX
+    near = np.isfinite(z) & (column >= -margin) & (row >= -margin) & (column < width + margin) & (row < height + margin)
+    column, row, z = column[near], row[near], z[near]
+    colors, radius = colors[near], 0.5 * view.intrinsics[0] * point_size_m[near] / z
+    radius = np.clip(radius, 1.0, _MAX_RADIUS_PX)
+    # Depth in the high bits and the point's index in the low ones: the minimum is the nearest point.
+    key = (z.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(len(z), dtype=np.uint64)
+    empty = np.uint64(2**64 - 1)
+    buffer = np.full(height * width, empty)
+    reach = int(np.ceil(radius.max())) if len(radius) else 0
+    for dv in range(-reach, reach + 1):
+        for du in range(-reach, reach + 1):
+            u, v = column + du, row + dv
+            inside = (du * du + dv * dv <= radius**2) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            np.minimum.at(buffer, v[inside] * width + u[inside], key[inside])
+    filled = buffer != empty
+    index = (buffer[filled] & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    color = np.zeros((height * width, 3))
+    depth = np.full(height * width, np.inf)
+    color[filled], depth[filled] = colors[index], z[index]
+    return color.reshape(height, width, 3), depth.reshape(height, width)
+
+
+def _edge_shading(depth: FloatArray) -> FloatArray:
+    """Darken pixels that lie behind their neighbours (eye-dome lighting): factors (H, W) in (0, 1]."""
+    log_depth = np.where(np.isfinite(depth), np.log(np.where(np.isfinite(depth), depth, 1.0)), np.nan)
+    total = np.zeros(depth.shape)
+    for shift in (1, 3):
+        for axis in (0, 1):
+            for step in (shift, -shift):
+                behind = log_depth - np.roll(log_depth, step, axis=axis)
+                total += np.clip(np.nan_to_num(behind, nan=0.0), 0.0, 0.2)
+    return np.exp(-_EDGE_STRENGTH * total)
