@@ -52,6 +52,15 @@ def test_round_trip(tmp_path: Path, ids: tuple[int, ...], far: bool) -> None:
     assert validate_sequence(root).ok
 
 
+@pytest.mark.parametrize(("num_tracks", "frames"), [(0, 3), (1, 2)])
+def test_few_tracks_and_frames(tmp_path: Path, num_tracks: int, frames: int) -> None:
+    root = uni4d_folder(tmp_path, num_tracks=num_tracks, frames=frames)
+    tracks = read_uni4d(root).tracks
+    assert tracks is not None
+    assert (tracks.num_tracks, tracks.num_frames) == (num_tracks, frames)
+    assert validate_sequence(root).ok
+
+
 def test_files_are_those_uni4d_reads(tmp_path: Path) -> None:
     root = uni4d_folder(tmp_path)
     depth = np.load(root / "unidepth" / "depth.npy")
