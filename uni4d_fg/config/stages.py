@@ -115,6 +115,9 @@ class NonRigidConfig(Section):
     arap_sigma_m: float = setting(0.01, "Sigma of the change of a neighbour distance, m.", gt=0)
     arap_weight: float = setting(1.0, "Weight of ARAP; 0 switches the term off.", ge=0)
     arap_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
+    annealing: tuple[float, ...] = setting(
+        (1.0,), "Successive solves with the smoothing of every 'norm' kernel multiplied by these factors; ends at 1."
+    )
     outlier_quantile: float = setting(
         0.98, "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.", gt=0, le=1
     )

@@ -1,0 +1,311 @@
+"""Stage 3: one world point per dynamic track and frame, cameras frozen.
+
+Points start at the lift of the depth cue corrected by its frame's scale; frames in which a track is hidden
+between two observations are bridged linearly. As-rigid-as-possible links each track to its nearest
+neighbours of the same instance; temporal smoothness links a track to itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.stages import NonRigidConfig
+from uni4d_fg.factors.arap import ARAP
+from uni4d_fg.factors.batch import FactorBatch, Slot
+from uni4d_fg.factors.depth_prior import DYNAMIC_DEPTH_PRIOR
+from uni4d_fg.factors.dynamic_reprojection import DYNAMIC_REPROJECTION
+from uni4d_fg.factors.temporal_smoothness import ACCELERATION_SMOOTHNESS, VELOCITY_SMOOTHNESS
+from uni4d_fg.graph.state import State, VariableNames
+from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.summary import SolveSummary
+from uni4d_fg.stages.bundle_adjustment import StaticNoise
+from uni4d_fg.stages.lifting import lift
+from uni4d_fg.stages.neighbours import nearest_neighbours
+from uni4d_fg.stages.observations import Normalization, Observations, reprojection_weights
+from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
+
+
+@dataclass(frozen=True)
+class FrozenCameras:
+    """What stage 3 takes from stage 2."""
+
+    world_T_cam: FloatArray
+    """(T, 4, 4)."""
+    intrinsics: FloatArray
+    """(4,)."""
+    log_scale: FloatArray
+    """(T,)."""
+    noise: StaticNoise
+
+
+@dataclass(frozen=True)
+class PointMesh:
+    """Dynamic points as rows ordered by track and frame, and how they are linked."""
+
+    track: IntArray
+    """(M,) labelled track of each trajectory."""
+    instance: IntArray
+    """(M,) mask id of each trajectory."""
+    row: IntArray
+    """(M, T) row of point (trajectory, frame); -1 where there is none."""
+    observed: BoolArray
+    """(M, T)."""
+    pairs: IntArray
+    """(L, 2) neighbouring trajectories, each pair once."""
+
+    @property
+    def num_points(self) -> int:
+        """Number of rows P."""
+        return int((self.row >= 0).sum())
+
+    def consecutive(self, steps: int, observed_only: bool) -> list[IntArray]:
+        """Return the rows of every run of ``steps`` consecutive frames of a trajectory, one array per step."""
+        exists = self.row >= 0
+        if observed_only:
+            exists = exists & self.observed
+        count = exists.shape[1] - steps + 1
+        if count <= 0:
+            return [np.zeros(0, dtype=np.int64)] * steps
+        complete = np.logical_and.reduce([exists[:, i : i + count] for i in range(steps)])
+        trajectory, frame = np.nonzero(complete)
+        return [self.row[trajectory, frame + i] for i in range(steps)]
+
+    def linked(self, observed_only: bool) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Return the rows (k, t), (m, t), (k, t+1), (m, t+1) of every link that exists in both frames."""
+        exists = self.row >= 0
+        if observed_only:
+            exists = exists & self.observed
+        both = exists[self.pairs[:, 0]] & exists[self.pairs[:, 1]]
+        link, frame = np.nonzero(both[:, :-1] & both[:, 1:])
+        k, m = self.pairs[link, 0], self.pairs[link, 1]
+        return self.row[k, frame], self.row[m, frame], self.row[k, frame + 1], self.row[m, frame + 1]
+
+
+@dataclass(frozen=True)
+class NonRigidResult:
+    """Dynamic trajectories at the end of stage 3."""
+
+    points: FloatArray
+    """(M, T, 3) world, m; NaN outside each trajectory's span."""
+    observed: BoolArray
+    """(M, T)."""
+    track: IntArray
+    """(M,)."""
+    instance: IntArray
+    """(M,)."""
+    solve: SolveSummary | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+def nonrigid_stage(
+    state: State,
+    mesh: PointMesh,
+    observations: Observations,
+    rows: IntArray,
+    cameras: FrozenCameras,
+    config: NonRigidConfig,
+    *,
+    unsquared: bool,
+    normalization: Normalization,
+) -> Stage:
+    """Declare the solve.
+
+    Args:
+        state: Group 'dynamic_point' (P, 3), ordered by track and frame.
+        mesh: Rows and links.
+        observations: Observations of the mesh's tracks.
+        rows: (N,) row of each observation.
+        cameras: Frozen poses, intrinsics and depth scales.
+        config: Stage 3.
+        unsquared: The paper's norms and weights instead of the MAP estimate.
+        normalization: Weights of the paper's energy.
+    """
+    batches = _data_terms(observations, rows, cameras, config, unsquared, normalization)
+    steps = config.smoothness_order + 1
+    smooth_rows = mesh.consecutive(steps, observed_only=not config.bridge_gaps)
+    if config.smoothness_weight > 0 and len(smooth_rows[0]):
+        family = VELOCITY_SMOOTHNESS if steps == 2 else ACCELERATION_SMOOTHNESS
+        batches.append(
+            FactorBatch.create(
+                family,
+                tuple(Slot("dynamic_point", r) for r in smooth_rows),
+                sigma=1.0 if unsquared else config.smoothness_sigma_m,
+                weight=_link_weight(config.smoothness_weight, len(smooth_rows[0]), unsquared, normalization),
+                kernel=kernel_of(config.smoothness_kernel),
+            )
+        )
+    link_rows = mesh.linked(observed_only=not config.bridge_gaps)
+    if config.arap_weight > 0 and len(link_rows[0]):
+        batches.append(
+            FactorBatch.create(
+                ARAP,
+                tuple(Slot("dynamic_point", r) for r in link_rows),
+                sigma=1.0 if unsquared else config.arap_sigma_m,
+                weight=_link_weight(config.arap_weight, len(link_rows[0]), unsquared, normalization),
+                kernel=kernel_of(config.arap_kernel),
+            )
+        )
+    free = {"dynamic_point": np.ones((len(state["dynamic_point"]), 3), dtype=bool)}
+    return Stage("nonrigid", tuple(batches), free, config.solver, "trajectory_cg", annealing=config.annealing)
+
+
+def _link_weight(weight: float, count: int, unsquared: bool, normalization: Normalization) -> float:
+    return weight / count if unsquared and normalization == "mean" else weight
+
+
+def _data_terms(
+    observations: Observations,
+    rows: IntArray,
+    cameras: FrozenCameras,
+    config: NonRigidConfig,
+    unsquared: bool,
+    normalization: Normalization,
+) -> list[FactorBatch]:
+    """Return E_NR and the depth prior."""
+    out = []
+    pose = cameras.world_T_cam[observations.frame]
+    if config.reprojection:
+        weight = observations.weight
+        if unsquared:
+            weight = reprojection_weights(observations.frame, weight, len(cameras.world_T_cam), normalization)
+        out.append(
+            FactorBatch.create(
+                DYNAMIC_REPROJECTION,
+                (Slot("dynamic_point", rows),),
+                {
+                    "uv": observations.uv,
+                    "world_T_cam": pose,
+                    "intrinsics": np.broadcast_to(cameras.intrinsics, (len(rows), 4)),
+                },
+                sigma=1.0 if unsquared else config.reprojection_sigma_px or cameras.noise.reprojection_sigma_px,
+                weight=weight,
+                kernel=kernel_of(config.reprojection_kernel),
+            )
+        )
+    known = np.isfinite(observations.depth)
+    if config.depth_prior and known.any():
+        with_depth = observations.select(known)
+        out.append(
+            FactorBatch.create(
+                DYNAMIC_DEPTH_PRIOR,
+                (Slot("dynamic_point", rows[known]),),
+                {
+                    "depth": with_depth.depth,
+                    "world_T_cam": pose[known],
+                    "log_scale": cameras.log_scale[with_depth.frame],
+                },
+                sigma=config.depth_sigma or cameras.noise.depth_sigma,
+                weight=with_depth.weight,
+                kernel=kernel_of(config.depth_kernel),
+            )
+        )
+    return out
+
+
+def build_mesh(
+    observations: Observations,
+    instance_of_track: IntArray,
+    num_frames: int,
+    cameras: FrozenCameras,
+    config: NonRigidConfig,
+    dropped: dict[str, int],
+) -> tuple[PointMesh, Observations, IntArray, State]:
+    """Choose trajectories, lift their points and link neighbours.
+
+    Returns:
+        The mesh, the observations of its tracks, the row of each observation, and the starting state.
+    """
+    before = len(np.unique(observations.track))
+    observations = observations.with_min_observations(min(config.min_observations, num_frames))
+    lifted = lift(observations, cameras.world_T_cam, cameras.intrinsics, cameras.log_scale)
+    with_depth = np.isin(observations.track, observations.track[np.isfinite(lifted).all(axis=1)])
+    dropped["dynamic track with too few observations"] = before - len(np.unique(observations.track))
+    dropped["dynamic track without depth"] = len(np.unique(observations.track[~with_depth]))
+    observations, lifted = observations.select(with_depth), lifted[with_depth]
+    tracks, trajectory = observations.rows()
+    observed = np.zeros((len(tracks), num_frames), dtype=bool)
+    observed[trajectory, observations.frame] = True
+    exists = observed.copy()
+    if config.bridge_gaps:
+        exists = (
+            np.logical_or.accumulate(observed, axis=1) & np.logical_or.accumulate(observed[:, ::-1], axis=1)[:, ::-1]
+        )
+    row = np.full((len(tracks), num_frames), -1)
+    row[exists] = np.arange(int(exists.sum()))
+    points = np.full((len(tracks), num_frames, 3), np.nan)
+    points[trajectory, observations.frame] = lifted
+    _interpolate(points, exists)
+    instance = instance_of_track[tracks]
+    pairs = nearest_neighbours(points, observed, instance, config.neighbours, config.max_neighbour_ratio)
+    names = VariableNames(dynamic_track_frame=np.stack([tracks[np.nonzero(exists)[0]], np.nonzero(exists)[1]], axis=1))
+    state = State({"dynamic_point": points[exists]}, names)
+    mesh = PointMesh(tracks, instance, row, observed, pairs)
+    return mesh, observations, row[trajectory, observations.frame], state
+
+
+def _interpolate(points: FloatArray, exists: BoolArray) -> None:
+    """Fill points (M, T, 3) that exist but were not lifted, linearly in time; ends are held."""
+    missing = exists & ~np.isfinite(points).all(axis=2)
+    for k in np.flatnonzero(missing.any(axis=1)).tolist():
+        known = np.flatnonzero(np.isfinite(points[k]).all(axis=1))
+        gaps = np.flatnonzero(missing[k])
+        for a in range(3):
+            points[k, gaps, a] = np.interp(gaps, known, points[k, known, a])
+
+
+def solve_nonrigid(
+    observations: Observations,
+    instance_of_track: IntArray,
+    cameras: FrozenCameras,
+    config: NonRigidConfig,
+    *,
+    unsquared: bool,
+    normalization: Normalization,
+    hooks: Hooks | None = None,
+) -> NonRigidResult:
+    """Run stage 3; without dynamic tracks the result is empty.
+
+    Args:
+        observations: Trusted observations of dynamic tracks.
+        instance_of_track: (K,) mask id per labelled track.
+        cameras: Frozen poses, intrinsics and depth scales.
+        config: Stage 3.
+        unsquared: The paper's norms and weights instead of the MAP estimate.
+        normalization: Weights of the paper's energy.
+        hooks: Progress and cancellation.
+
+    Raises:
+        SolverError: If the system is singular or a cue is not finite.
+    """
+    num_frames = len(cameras.world_T_cam)
+    dropped: dict[str, int] = {}
+    mesh, observations, rows, state = build_mesh(observations, instance_of_track, num_frames, cameras, config, dropped)
+    if mesh.num_points == 0:
+        empty = np.zeros((0, num_frames))
+        return NonRigidResult(empty[..., None] + np.zeros(3), empty > 0, mesh.track, mesh.instance, None, dropped)
+    stage = nonrigid_stage(
+        state, mesh, observations, rows, cameras, config, unsquared=unsquared, normalization=normalization
+    )
+    state, summary = run_stage(stage, state, hooks)
+    points = np.full((*mesh.row.shape, 3), np.nan)
+    points[mesh.row >= 0] = state["dynamic_point"]
+    keep = _energy_inliers(points, mesh, config)
+    dropped["dynamic track with a large motion energy"] = int((~keep).sum())
+    return NonRigidResult(points[keep], mesh.observed[keep], mesh.track[keep], mesh.instance[keep], summary, dropped)
+
+
+def _energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
+    """Return which trajectories move plausibly.
+
+    A trajectory's energy is its largest |step| relative to the median step of its instance and frame, so
+    that a fast object is not punished for its speed; those above the quantile plus margin are dropped.
+    """
+    step = np.linalg.norm(np.diff(points, n=config.smoothness_order, axis=1), axis=2)
+    if step.shape[1] == 0:
+        return np.ones(len(points), dtype=bool)
+    energy = np.nanmax(np.nan_to_num(step) / config.smoothness_sigma_m, axis=1)
+    result: BoolArray = energy <= np.quantile(energy, config.outlier_quantile) + config.outlier_margin
+    return result
