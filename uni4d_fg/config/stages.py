@@ -29,7 +29,7 @@ class CameraInitConfig(Section):
     )
     min_tracks_per_frame: int = setting(12, "Frames with fewer usable tracks are bridged by constant velocity.", ge=3)
     free_intrinsics: bool = setting(
-        True, "Let the focal lengths move in the window solves (if input.intrinsics is free)."
+        False, "Let the focal lengths move in the window solves (if input.intrinsics is free)."
     )
     focal_prior_fraction: float = setting(
         0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0
@@ -53,7 +53,11 @@ class BundleAdjustmentConfig(Section):
         True, "Replace both by the static scene's own (median absolute deviation) after a first solve."
     )
     reprojection_sigma_factor: float = setting(1.0, "Measured reprojection sigma is multiplied by this.", gt=0)
-    depth_sigma_factor: float = setting(1.0, "Measured depth sigma is multiplied by this.", gt=0)
+    depth_sigma_factor: float = setting(
+        8.0,
+        "The depth prior of the camera solves is this much wider: a cue errs alike in neighbouring pixels and frames.",
+        gt=0,
+    )
     min_reprojection_sigma_px: float = setting(0.1, "Floor of the measured reprojection sigma, px.", gt=0)
     min_depth_sigma: float = setting(0.002, "Floor of the measured depth sigma.", gt=0)
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of E_BA.")
@@ -77,9 +81,14 @@ class BundleAdjustmentConfig(Section):
         le=1,
     )
     outlier_factor: float = setting(3.0, "Factor on that quantile.", gt=0)
-    relift: bool = setting(
-        False,
-        "After the solve, replace landmarks by the mean lift of the depth cue (the reference's choice).",
+    drift_frames: float = setting(
+        5.0, "A track's observation this many frames from its query frame has twice the variance (tracks drift).", gt=0
+    )
+    structure: Literal["refine", "relift", "keep"] = setting(
+        "refine",
+        "Landmarks after the solve. 'refine': solve them and the frames' scales once more with frozen cameras and "
+        "the depth prior at its measured sigma; 'relift': mean lift of the depth cue (the reference's choice); "
+        "'keep': as they are.",
     )
     solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-4), "Solver.")
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch, Slot
@@ -55,6 +55,8 @@ class BundleAdjustmentResult:
     observations: Observations
     """Observations of the kept landmarks."""
     noise: StaticNoise
+    landmark_error: Float32Array
+    """(N,) median reprojection error, px."""
     solves: list[SolveSummary] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     """Number of observations or landmarks dropped, per reason."""
@@ -119,10 +121,39 @@ def bundle_adjustment_stage(
             batches.append(intrinsics_prior(prior_intrinsics, config.focal_prior_fraction))
     if config.depth_prior:
         free["log_scale"] = np.ones((num_frames, 1), dtype=bool)
-        batches += depth_prior_terms(observations, row, noise.depth_sigma, num_frames, config)
+        sigma = noise.depth_sigma * config.depth_sigma_factor
+        batches += depth_prior_terms(observations, row, sigma, num_frames, config)
     elif freedom.poses:
         batches += scale_anchor(state["pose"])
     return Stage("bundle_adjustment", tuple(batches), free, config.solver, "schur", eliminate="landmark")
+
+
+def structure_stage(
+    state: State, observations: Observations, noise: StaticNoise, config: BundleAdjustmentConfig
+) -> Stage:
+    """Declare the refinement of landmarks and frame scales with frozen cameras.
+
+    Bundle adjustment widens the depth prior (``depth_sigma_factor``) because the errors of a depth cue are
+    correlated and would bias the cameras. With the cameras known, the structure is best where triangulation
+    and all depth cues of a track agree, each at its own noise.
+    """
+    num_frames = len(state["pose"])
+    _, row = observations.rows()
+    slots = (Slot("pose", observations.frame), Slot("landmark", row), Slot("intrinsics", np.zeros_like(row)))
+    reprojection = FactorBatch.create(
+        STATIC_REPROJECTION,
+        slots,
+        {"uv": observations.uv},
+        sigma=noise.reprojection_sigma_px,
+        weight=observations.weight,
+        kernel=kernel_of(config.reprojection_kernel),
+    )
+    depth = depth_prior_terms(observations, row, min(noise.depth_sigma, config.depth_sigma), num_frames, config)
+    free = {
+        "landmark": np.ones((len(state["landmark"]), 3), dtype=bool),
+        "log_scale": np.ones((num_frames, 1), dtype=bool),
+    }
+    return Stage("structure", (reprojection, *depth), free, config.solver, "schur", eliminate="landmark")
 
 
 def depth_prior_terms(
@@ -137,7 +168,7 @@ def depth_prior_terms(
             STATIC_DEPTH_PRIOR,
             slots,
             {"depth": with_depth.depth},
-            sigma=sigma * config.depth_sigma_factor,
+            sigma=sigma,
             weight=with_depth.weight,
             kernel=kernel_of(config.depth_kernel),
         ),
@@ -218,20 +249,41 @@ def adjust_bundle(
                 f"bundle adjustment: every observation was dropped as an outlier in round {index + 1} "
                 f"(limit {config.max_reprojection_px} px); are the intrinsics or the masks wrong?"
             )
+    if config.structure == "refine" and not unsquared and solves[-1].termination is not Termination.CANCELLED:
+        for _ in range(2):  # the second solve uses the depth noise that the first one reveals
+            state, summary = run_stage(structure_stage(state, observations, noise, config), state, hooks)
+            solves.append(summary)
+            noise = _measure(state, observations, noise, config)
     landmarks = state["landmark"]
-    if config.relift:
+    if config.structure == "relift":
         tracks, row = observations.rows()
         points = lift(observations, state["pose"], state["intrinsics"][0], state["log_scale"][:, 0])
-        landmarks = mean_per_row(points, observations.weight, row, len(tracks))
+        relifted = mean_per_row(points, observations.weight, row, len(tracks))
+        landmarks = np.where(np.isfinite(relifted), relifted, landmarks)
     track = state.names.landmark_track
     assert track is not None
     keep = _spatial_inliers(landmarks, config)
     dropped["landmark far from its neighbours"] = int((~keep).sum())
+    error = _landmark_error(state.replace(landmark=landmarks), observations)[keep]
     observations = observations.select(np.isin(observations.track, track[keep]))
     return BundleAdjustmentResult(
         state["pose"], state["intrinsics"][0], state["log_scale"][:, 0], landmarks[keep], track[keep],
-        observations, noise, solves, dropped,
+        observations, noise, error, solves, dropped,
     )  # fmt: skip
+
+
+def _landmark_error(state: State, observations: Observations) -> Float32Array:
+    """Return each landmark's median reprojection error, (N,) px."""
+    tracks, row = observations.rows()
+    residual = STATIC_REPROJECTION.residual(
+        state["pose"][observations.frame], state["landmark"][row], state["intrinsics"][[0] * len(row)],
+        uv=observations.uv,
+    )  # fmt: skip
+    norm = np.linalg.norm(residual, axis=1)
+    order = np.lexsort([norm, row])
+    start = np.searchsorted(row[order], np.arange(len(tracks) + 1))
+    middle = (start[:-1] + start[1:] - 1) // 2
+    return np.asarray(norm[order][middle], dtype=np.float32)
 
 
 def _make_state(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
 
 Normalization = Literal["mean", "sum"]
@@ -58,6 +58,21 @@ def observations_of(labelled: LabelledTracks, *labels: TrackLabel) -> Observatio
         labelled.depth[track, frame].astype(np.float64),
         labelled.weight[track, frame].astype(np.float64),
     )
+
+
+def weigh_by_drift(observations: Observations, query_frame: Int32Array, drift_frames: float) -> Observations:
+    """Lower the weight of observations far from their track's query frame: ``w / (1 + |t - q| / drift_frames)``.
+
+    A tracker that follows a point from frame to frame accumulates a random walk, whose variance grows
+    linearly with the number of steps.
+
+    Args:
+        observations: N observations.
+        query_frame: (K,) frame in which each track was started.
+        drift_frames: Steps after which the variance has doubled.
+    """
+    steps = np.abs(observations.frame - query_frame[observations.track])
+    return replace(observations, weight=observations.weight / (1.0 + steps / drift_frames))
 
 
 def reprojection_weights(frame: IntArray, weight: FloatArray, num_frames: int, kind: Normalization) -> FloatArray:

@@ -1,0 +1,111 @@
+r"""Dense depth that agrees with the sparse points.
+
+For every pixel x of an instance, with n(x) the nearest control points of that same instance in 3D,
+
+    depth(x) = D(x) exp( sum_{i in n(x)} w_i s_i ),   s_i = log z(p_i) - log D(uv_i),   w_i ~ 1 / d_i^2
+
+where d_i is the distance between the lifts of x and of uv_i with the raw cue D (Uni4D, densification; in
+logarithms, and per instance for every instance). A control point's own noise would be copied into the dense
+map, so each s_i is first replaced by the median over its nearest control points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
+from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.geometry.camera import unproject
+
+_MIN_SQUARED_DISTANCE = 1e-8
+
+
+@dataclass(frozen=True)
+class ControlPoints:
+    """Points of one frame whose depth is known besides the cue."""
+
+    uv: FloatArray
+    """(N, 2) px."""
+    cue: FloatArray
+    """(N,) depth cue at uv, m."""
+    log_scale: FloatArray
+    """(N,) log of the point's depth over the cue."""
+    instance: Int32Array
+    """(N,) 0 static, > 0 instance."""
+
+
+def densify_frame(
+    depth: Float32Array,
+    mask: Int32Array,
+    intrinsics: FloatArray,
+    control: ControlPoints,
+    frame_log_scale: float,
+    config: FusionConfig,
+) -> Float32Array:
+    """Correct one frame's depth cue.
+
+    Args:
+        depth: (H, W) cue, m, NaN where missing.
+        mask: (H, W) 0 static, > 0 instance.
+        intrinsics: (4,) px.
+        control: Control points of this frame.
+        frame_log_scale: The frame's own log-scale: used where an instance has too few control points.
+        config: Fusion.
+
+    Returns:
+        (H, W) float32 m, NaN exactly where the cue is.
+    """
+    height, width = depth.shape
+    out = depth * np.float32(np.exp(frame_log_scale))
+    nodes = _grid(depth, intrinsics, config.stride)
+    plausible = np.isfinite(control.log_scale) & (np.abs(control.log_scale - frame_log_scale) <= config.max_log_scale)
+    for label in np.unique(mask).tolist():
+        mine = np.flatnonzero(plausible & (control.instance == label))
+        if len(mine) < config.min_control_points:
+            continue
+        anchors = unproject(intrinsics, control.uv[mine], control.cue[mine])
+        scale = _smooth(anchors, control.log_scale[mine], config.smoothing)
+        field = _interpolate(nodes, anchors, scale, frame_log_scale, config.neighbours)
+        pixels = mask == label
+        dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
+        out[pixels] = depth[pixels] * np.exp(dense[pixels])
+    return out
+
+
+def _grid(depth: Float32Array, intrinsics: FloatArray, stride: int) -> FloatArray:
+    """Lift the centres of stride x stride cells, (rows, columns, 3); NaN where a cell has no depth."""
+    height, width = depth.shape
+    rows, columns = -(-height // stride), -(-width // stride)
+    # Centres as cv2.resize places them, so that its bilinear interpolation has no shift.
+    v = (np.arange(rows) + 0.5) * height / rows - 0.5
+    u = (np.arange(columns) + 0.5) * width / columns - 0.5
+    uu, vv = np.meshgrid(u, v)
+    sampled = depth[np.rint(vv).astype(np.int64), np.rint(uu).astype(np.int64)].astype(np.float64)
+    result: FloatArray = unproject(intrinsics, np.stack([uu, vv], axis=-1), sampled)
+    return result
+
+
+def _smooth(anchors: FloatArray, scale: FloatArray, count: int) -> FloatArray:
+    """Replace each scale by the median over its ``count`` nearest control points (itself included)."""
+    k = min(count, len(anchors))
+    if k < 2:
+        return scale
+    _, index = cKDTree(anchors).query(anchors, k=k)
+    result: FloatArray = np.median(scale[index], axis=1)
+    return result
+
+
+def _interpolate(nodes: FloatArray, anchors: FloatArray, scale: FloatArray, default: float, count: int) -> Float32Array:
+    """Interpolate log-scales at grid nodes (rows, columns, 3) by inverse squared distance, (rows, columns)."""
+    field = np.full(nodes.shape[:2], default)
+    known = np.isfinite(nodes).all(axis=-1)
+    k = min(count, len(anchors))
+    distance, index = cKDTree(anchors).query(nodes[known], k=k)
+    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+    weight = 1.0 / np.maximum(distance**2, _MIN_SQUARED_DISTANCE)
+    field[known] = np.sum(weight * scale[index], axis=1) / np.sum(weight, axis=1)
+    return field.astype(np.float32)

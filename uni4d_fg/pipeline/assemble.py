@@ -1,0 +1,107 @@
+"""The reconstruction of a run, and the files a person opens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from uni4d_fg.arrays import ImageArray, Int32Array
+from uni4d_fg.config.models import Config
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.evaluate.trajectory import Trajectory
+from uni4d_fg.evaluate.tum import write_tum
+from uni4d_fg.fusion.clouds import dynamic_cloud, dynamic_clouds, static_cloud
+from uni4d_fg.pipeline.steps import Arrays
+from uni4d_fg.reconstruction.clouds import write_clouds
+from uni4d_fg.reconstruction.depth_store import read_depth
+from uni4d_fg.reconstruction.io import save_reconstruction
+from uni4d_fg.reconstruction.model import Reconstruction
+from uni4d_fg.reconstruction.pictures import draw_depth_strip, draw_scene, draw_trajectory
+from uni4d_fg.reconstruction.run_folder import RunFolder
+from uni4d_fg.sequence.model import Sequence
+from uni4d_fg.tracks.model import LabelledTracks
+
+
+def assemble(sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> Reconstruction:
+    """Bring the stages' results into one :class:`Reconstruction`, with colours from the images."""
+    landmark_track = scene["landmark_track"].astype(np.int32)
+    dynamic_track = motion["track"].astype(np.int32)
+    colors = _track_colors(sequence, labelled, np.concatenate([landmark_track, dynamic_track]))
+    return Reconstruction(
+        world_T_cam=scene["world_T_cam"],
+        intrinsics=scene["intrinsics"],
+        timestamps=sequence.timestamps,
+        image_size=sequence.image_size,
+        depth_log_scale=scene["log_scale"],
+        landmarks=scene["landmarks"],
+        landmark_track=landmark_track,
+        landmark_color=colors[: len(landmark_track)],
+        landmark_error=scene["landmark_error"],
+        dynamic_points=motion["points"],
+        dynamic_observed=motion["observed"],
+        dynamic_track=dynamic_track,
+        dynamic_instance=motion["instance"].astype(np.int32),
+        dynamic_color=colors[len(landmark_track) :],
+    )
+
+
+def _track_colors(sequence: Sequence, labelled: LabelledTracks, tracks: Int32Array) -> ImageArray:
+    """Return the image colour of each track in the first frame that shows it, (N, 3) RGB."""
+    out = np.zeros((len(tracks), 3), dtype=np.uint8)
+    if len(tracks) == 0:
+        return out
+    first = np.argmax(labelled.weight[tracks] > 0, axis=1)
+    height, width = sequence.image_size
+    for frame in np.unique(first).tolist():
+        mine = np.flatnonzero(first == frame)
+        uv = np.rint(labelled.tracks.uv[tracks[mine], frame]).astype(np.int64)
+        image = sequence.images[frame]
+        out[mine] = image[np.clip(uv[:, 1], 0, height - 1), np.clip(uv[:, 0], 0, width - 1)]
+    return out
+
+
+def write_result(folder: RunFolder, reconstruction: Reconstruction) -> None:
+    """Write ``reconstruction.npz`` and ``trajectory.tum``.
+
+    Raises:
+        OutputError: If a file cannot be written.
+    """
+    save_reconstruction(folder.reconstruction, reconstruction)
+    write_tum(folder.trajectory, Trajectory(reconstruction.timestamps, reconstruction.world_T_cam))
+
+
+def write_views(
+    folder: RunFolder,
+    sequence: Sequence,
+    reconstruction: Reconstruction,
+    config: Config,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Write clouds and pictures, as the config asks.
+
+    Raises:
+        Cancelled: If ``should_stop`` said so.
+        OutputError: If a file cannot be written.
+        MissingDependencyError: If clouds are asked for and Open3D cannot be loaded.
+    """
+    if not (config.output.clouds or config.output.pictures):
+        return
+    depth = read_depth(folder.depth)
+    intrinsics, poses = reconstruction.intrinsics, reconstruction.world_T_cam
+    static = static_cloud(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion)
+    if config.output.clouds:
+        moving = dynamic_clouds(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion)
+        write_clouds(folder, static, moving)
+    if should_stop():
+        raise Cancelled("stopped before the pictures; --resume continues")
+    if config.output.pictures:
+        draw_trajectory(folder.trajectory_picture, poses, sequence.ground_truth.world_T_cam)
+        draw_depth_strip(folder.depth_picture, sequence.images, sequence.depths, depth)
+
+        def dynamic(frame: int) -> tuple[np.ndarray, ImageArray]:
+            return dynamic_cloud(
+                sequence.images[frame], depth[frame], sequence.masks[frame], intrinsics, poses[frame], config.fusion
+            )
+
+        draw_scene(folder.scene_picture, reconstruction, static, dynamic)

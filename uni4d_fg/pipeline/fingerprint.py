@@ -1,0 +1,53 @@
+"""Hashes that say whether a stage's stored result still belongs to its inputs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.sequence.model import Sequence
+
+ALGORITHM_VERSION = 1
+"""Part of every key; raised whenever a stage gives another result for the same input and configuration."""
+
+
+def sequence_key(sequence: Sequence, should_stop: Callable[[], bool] | None = None) -> str:
+    """Hash every image, depth map and mask, the calibration, poses and tracks (frame by frame).
+
+    Raises:
+        Cancelled: If ``should_stop`` said so.
+        InputError: If a frame cannot be read.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for frame in range(sequence.num_frames):
+        if should_stop is not None and should_stop():
+            raise Cancelled("stopped while reading the sequence")
+        for source in (sequence.images, sequence.depths, sequence.masks):
+            _update(digest, source[frame])
+    _update(digest, sequence.intrinsics)
+    _update(digest, sequence.timestamps)
+    if sequence.initial_world_T_cam is not None:
+        _update(digest, sequence.initial_world_T_cam)
+    if sequence.tracks is not None:
+        for array in (sequence.tracks.uv, sequence.tracks.visible, sequence.tracks.query_frame):
+            _update(digest, array)
+    return digest.hexdigest()
+
+
+def stage_key(previous: str, *sections: Any) -> str:
+    """Hash the key of what a stage builds on together with the configuration it reads."""
+    digest = hashlib.blake2b(f"{ALGORITHM_VERSION} {previous}".encode(), digest_size=16)
+    for section in sections:
+        data = section.model_dump(mode="json") if hasattr(section, "model_dump") else section
+        digest.update(json.dumps(data, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def _update(digest: hashlib.blake2b, array: np.ndarray) -> None:
+    digest.update(f"{array.shape} {array.dtype}".encode())
+    digest.update(np.ascontiguousarray(array).data)

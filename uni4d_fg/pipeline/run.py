@@ -1,0 +1,183 @@
+"""Run the stages in order, keep each as it ends, and write the run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.config.load import dump_config
+from uni4d_fg.config.models import Config
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.files import atomic_write_json, atomic_write_text
+from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
+from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
+from uni4d_fg.pipeline.fuse import fuse_depth
+from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
+from uni4d_fg.pipeline.store import StageRecord, StageStore
+from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
+from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.reconstruction.labels_io import load_labels, save_labels
+from uni4d_fg.reconstruction.run_folder import RunFolder
+from uni4d_fg.sequence.model import Sequence
+from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.tracks.cache import load_or_track
+from uni4d_fg.tracks.labels import label_tracks
+from uni4d_fg.tracks.model import LabelledTracks
+
+
+@dataclass
+class _Run:
+    """What the steps of one run share."""
+
+    sequence: Sequence
+    config: Config
+    folder: RunFolder
+    store: StageStore
+    resume: bool
+    reporter: Reporter
+    should_stop: Callable[[], bool]
+    summary: RunSummary
+
+    def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord]) -> Arrays:
+        """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored."""
+        began = time.perf_counter()
+        record = self.store.load(name, key) if self.resume else None
+        resumed = record is not None
+        if record is None:
+            self._check_cancelled()
+            # A step may write files besides its record: an old record must not vouch for half-new ones.
+            self.store.discard(name)
+            self.reporter.begin(name.replace("_", " "), None)
+            counter = iter(range(1, 1 << 30))
+            hooks = Hooks(
+                on_iteration=lambda solve, _, energy: self.reporter.advance(
+                    next(counter), f"{solve}: energy {energy:.5g}"
+                ),
+                should_stop=self.should_stop,
+            )
+            record = compute(hooks)
+            self.store.save(name, key, record)
+            self.reporter.end()
+        self._note(name, record.summary, time.perf_counter() - began, resumed)
+        return record.arrays
+
+    def track_progress(self, done: int, total: int) -> None:
+        """Report the tracker's steps."""
+        self.reporter.advance(done, f"step {done} of {total}")
+
+    def _note(self, name: str, summary: dict[str, Any], seconds: float, resumed: bool) -> None:
+        warnings = summary.get("warnings", [])
+        rest = {field: value for field, value in summary.items() if field != "warnings"}
+        self.summary.stages[name] = {
+            "seconds": seconds, "peak_memory_mb": peak_memory_mb(), "resumed": resumed, **rest
+        }  # fmt: skip
+        self.summary.warnings += warnings
+
+    def _check_cancelled(self) -> None:
+        if self.should_stop():
+            raise Cancelled("stopped; finished stages are kept, --resume continues from them")
+
+
+def reconstruct(
+    sequence: Sequence,
+    run_dir: Path,
+    config: Config,
+    *,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> RunSummary:
+    """Reconstruct a sequence and write the run folder.
+
+    Args:
+        sequence: Frames and cues.
+        run_dir: Folder of the run; made if absent.
+        config: Everything else the result depends on.
+        resume: Take over stages stored in ``run_dir`` whose inputs and configuration have not changed.
+        reporter: Progress.
+        should_stop: Polled often; True ends the run with :class:`Cancelled`, finished stages kept.
+
+    Returns:
+        The summary that is also written as ``summary.json``.
+
+    Raises:
+        InputError: If a cue cannot be read.
+        DegenerateProblemError: If the cues do not determine the cameras.
+        SolverError: If a stage cannot be solved.
+        OutputError: If a result cannot be written.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    folder = RunFolder(run_dir)
+    height, width = sequence.image_size
+    summary = RunSummary(
+        {
+            "name": sequence.name,
+            "root": None if sequence.root is None else str(sequence.root.resolve()),
+            "num_frames": sequence.num_frames,
+            "image_size": [height, width],
+        }
+    )
+    run = _Run(
+        sequence, config, folder, StageStore(run_dir / "stages"), resume,
+        reporter or SilentReporter(), should_stop or (lambda: False), summary,
+    )  # fmt: skip
+    atomic_write_text(folder.config, dump_config(config))
+    key = sequence_key(sequence, run.should_stop)
+    key, labelled = _labels(run, key)
+    key = stage_key(key, config.camera_init, config.input, config.energy, config.normalization)
+    cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks))
+    key = stage_key(key, config.bundle_adjustment)
+    scene = run.step(
+        "bundle_adjustment", key, lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks)
+    )
+    key = stage_key(key, config.nonrigid)
+    motion = run.step("nonrigid", key, lambda hooks: nonrigid_step(labelled, scene, config, hooks))
+    key = stage_key(key, config.fusion)
+    _fuse(run, key, labelled, scene, motion)
+    reconstruction = assemble(sequence, labelled, scene, motion)
+    write_result(folder, reconstruction)
+    began = time.perf_counter()
+    run.reporter.begin("clouds and pictures", None)
+    write_views(folder, sequence, reconstruction, config, run.should_stop)
+    run.reporter.end()
+    run._note("output", {}, time.perf_counter() - began, False)
+    atomic_write_json(folder.summary, summary.to_dict())
+    return summary
+
+
+def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
+    """Track and label; the labelled tracks are stored in ``labels.npz``, their key beside the stages."""
+    sequence, config = run.sequence, run.config
+    key = stage_key(key, config.tracking if sequence.tracks is None else None, config.labels, config.input)
+
+    def compute(hooks: Hooks) -> StageRecord:
+        cache = run.store.folder
+        tracks = load_or_track(sequence, config.tracking, cache, run.track_progress, run.should_stop)
+        labelled = label_tracks(tracks, sequence, config.labels, config.input)
+        save_labels(run.folder.labels, labelled)
+        counts = labelled.counts()
+        facts = [", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())]
+        return StageRecord({"num_tracks": np.array(tracks.num_tracks)}, {"tracks": counts, "facts": facts})
+
+    if run.resume and not run.folder.labels.exists():
+        run.store.discard("tracks")
+    run.step("tracks", key, compute)
+    return key, load_labels(run.folder.labels)
+
+
+def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> None:
+    if run.resume and not run.folder.depth.exists():
+        run.store.discard("fusion")
+
+    def compute(hooks: Hooks) -> StageRecord:
+        fuse_depth(
+            run.folder.depth, run.sequence, labelled, scene, motion, run.config.fusion, run.reporter, run.should_stop
+        )
+        return StageRecord({}, {})
+
+    run.step("fusion", key, compute)

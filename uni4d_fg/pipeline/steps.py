@@ -1,0 +1,192 @@
+"""The steps of a run as functions from earlier records to a new one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.energy import static_energy
+from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
+from uni4d_fg.pipeline.store import StageRecord
+from uni4d_fg.pipeline.summary import solve_dict
+from uni4d_fg.sequence.model import Sequence
+from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.summary import SolveSummary, Termination
+from uni4d_fg.stages.bundle_adjustment import (
+    BundleAdjustmentResult,
+    Freedom,
+    StaticNoise,
+    adjust_bundle,
+)
+from uni4d_fg.stages.camera_init import initialize_cameras
+from uni4d_fg.stages.nonrigid import FrozenCameras, solve_nonrigid
+from uni4d_fg.stages.observations import observations_of, weigh_by_drift
+from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+
+def camera_init_step(sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks) -> StageRecord:
+    """Stage 1, or the given poses when the config takes them."""
+    if config.input.poses != "estimate":
+        if sequence.initial_world_T_cam is None:
+            raise InputError(
+                f"input.poses is '{config.input.poses}' but {sequence.name} brings no poses; add "
+                "world_T_cam_init.npy (T, 4, 4) to the sequence or set input.poses to 'estimate'"
+            )
+        arrays = {"world_T_cam": sequence.initial_world_T_cam, "intrinsics": sequence.intrinsics}
+        return StageRecord(arrays, {"solves": [], "facts": [f"poses taken from the sequence ({config.input.poses})"]})
+    result = initialize_cameras(
+        labelled,
+        sequence.intrinsics,
+        config.camera_init,
+        free_intrinsics=config.input.intrinsics == "free" and config.camera_init.free_intrinsics,
+        unsquared=config.energy == "unsquared",
+        normalization=config.normalization,
+        hooks=hooks,
+    )
+    _stop_if_cancelled(result.windows)
+    facts = [f"{len(result.windows)} windows, {sum(len(w.iterations) for w in result.windows)} iterations in all"]
+    summary: dict[str, Any] = {
+        "solves": [solve_dict(w) for w in result.windows],
+        "facts": facts,
+        "bridged_frames": list(result.bridged_frames),
+    }
+    if result.bridged_frames:
+        summary["warnings"] = [
+            f"{len(result.bridged_frames)} frames have too few static tracks and are posed by constant velocity: "
+            f"{_listed(result.bridged_frames)}"
+        ]
+    return StageRecord({"world_T_cam": result.world_T_cam, "intrinsics": result.intrinsics}, summary)
+
+
+def bundle_adjustment_step(
+    sequence: Sequence, labelled: LabelledTracks, cameras: Arrays, config: Config, hooks: Hooks
+) -> StageRecord:
+    """Stage 2; with fixed poses and no static track the given cameras are kept as they are."""
+    stage = config.bundle_adjustment
+    observations = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
+    if config.energy == "map":
+        observations = weigh_by_drift(observations, labelled.tracks.query_frame, stage.drift_frames)
+    fixed = config.input.poses == "fixed"
+    try:
+        result = adjust_bundle(
+            observations,
+            cameras["world_T_cam"],
+            cameras["intrinsics"],
+            sequence.intrinsics,
+            stage,
+            Freedom(poses=not fixed, intrinsics=config.input.intrinsics == "free"),
+            unsquared=config.energy == "unsquared",
+            normalization=config.normalization,
+            hooks=hooks,
+        )
+    except DegenerateProblemError:
+        if not fixed:
+            raise
+        return _without_landmarks(cameras, config)
+    _stop_if_cancelled(result.solves)
+    return StageRecord(_bundle_arrays(result), _bundle_summary(sequence, result, config))
+
+
+def _bundle_arrays(result: BundleAdjustmentResult) -> dict[str, npt.NDArray[Any]]:
+    return {
+        "world_T_cam": result.world_T_cam,
+        "intrinsics": result.intrinsics,
+        "log_scale": result.log_scale,
+        "landmarks": result.landmarks,
+        "landmark_track": result.landmark_track,
+        "landmark_error": result.landmark_error,
+        "noise": np.array([result.noise.reprojection_sigma_px, result.noise.depth_sigma]),
+    }
+
+
+def _bundle_summary(sequence: Sequence, result: BundleAdjustmentResult, config: Config) -> dict[str, Any]:
+    fx, fy = result.intrinsics[:2]
+    facts = [
+        f"{len(result.landmarks)} landmarks, {len(result.observations)} observations, "
+        f"fx {fx:.1f} fy {fy:.1f} px, noise {result.noise.reprojection_sigma_px:.2f} px, "
+        f"depth {100 * result.noise.depth_sigma:.1f} %"
+    ]
+    warnings = []
+    change = float(np.abs(result.intrinsics[:2] / sequence.intrinsics[:2] - 1.0).max())
+    if change > 0.15:
+        warnings.append(f"the focal lengths moved by {100 * change:.0f} % from the given ones")
+    baseline = np.linalg.norm(result.world_T_cam[:, :3, 3] - result.world_T_cam[0, :3, 3], axis=1).max()
+    depth = float(np.median(np.linalg.norm(result.landmarks - result.world_T_cam[0, :3, 3], axis=1)))
+    if baseline < 0.01 * depth:
+        warnings.append(
+            f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
+            "depth comes from the cue alone, and the focal length is poorly determined"
+        )
+    return {
+        "solves": [solve_dict(s) for s in result.solves],
+        "dropped": result.dropped,
+        "facts": facts,
+        "warnings": warnings,
+        "exact_energy": static_energy(
+            result.world_T_cam, result.intrinsics, result.landmarks, result.observations, config.normalization
+        ),
+    }
+
+
+def _without_landmarks(cameras: Arrays, config: Config) -> StageRecord:
+    num_frames = len(cameras["world_T_cam"])
+    stage = config.bundle_adjustment
+    arrays = {
+        "world_T_cam": cameras["world_T_cam"],
+        "intrinsics": cameras["intrinsics"],
+        "log_scale": np.zeros(num_frames),
+        "landmarks": np.zeros((0, 3)),
+        "landmark_track": np.zeros(0, dtype=np.int64),
+        "landmark_error": np.zeros(0, dtype=np.float32),
+        "noise": np.array([stage.reprojection_sigma_px, stage.depth_sigma]),
+    }
+    warning = "no static track with depth: cameras kept as given, depth scales not estimated, noise not measured"
+    return StageRecord(arrays, {"solves": [], "warnings": [warning]})
+
+
+def nonrigid_step(labelled: LabelledTracks, scene: Arrays, config: Config, hooks: Hooks) -> StageRecord:
+    """Stage 3; empty without dynamic tracks."""
+    result = solve_nonrigid(
+        observations_of(labelled, TrackLabel.DYNAMIC),
+        labelled.instance.astype(np.int64),
+        frozen_cameras(scene),
+        config.nonrigid,
+        unsquared=config.energy == "unsquared",
+        normalization=config.normalization,
+        hooks=hooks,
+    )
+    solves = [] if result.solve is None else [result.solve]
+    _stop_if_cancelled(solves)
+    arrays = {
+        "points": result.points,
+        "observed": result.observed,
+        "track": result.track,
+        "instance": result.instance,
+    }
+    facts = [f"{len(result.track)} trajectories of {len(np.unique(result.instance))} instances"]
+    summary = {"solves": [solve_dict(s) for s in solves], "dropped": result.dropped, "facts": facts}
+    return StageRecord(arrays, summary)
+
+
+def frozen_cameras(scene: Arrays) -> FrozenCameras:
+    """Return what stage 3 takes from a stage 2 record."""
+    pixel, relative = scene["noise"].tolist()
+    log_scale: FloatArray = scene["log_scale"]
+    return FrozenCameras(scene["world_T_cam"], scene["intrinsics"], log_scale, StaticNoise(pixel, relative))
+
+
+def _stop_if_cancelled(solves: list[SolveSummary]) -> None:
+    if any(solve.termination is Termination.CANCELLED for solve in solves):
+        raise Cancelled("stopped; finished stages are kept, --resume continues from them")
+
+
+def _listed(frames: tuple[int, ...]) -> str:
+    text = ", ".join(str(f) for f in frames[:10])
+    return text + (", ..." if len(frames) > 10 else "")

@@ -1,0 +1,74 @@
+"""The report of a run: what every stage did, what was dropped and why, what to distrust."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import sys
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from uni4d_fg.solve.summary import SolveSummary
+
+
+@dataclass
+class RunSummary:
+    """Everything ``summary.json`` holds."""
+
+    sequence: dict[str, Any]
+    """Name, root, frames, image size."""
+    stages: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Per stage: seconds, peak memory, whether it was resumed, solves, dropped counts."""
+    warnings: list[str] = field(default_factory=list)
+    """What to distrust, one sentence each."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return {
+            "sequence": self.sequence,
+            "stages": self.stages,
+            "warnings": self.warnings,
+            "versions": versions(),
+        }
+
+    def lines(self) -> list[str]:
+        """Return one screen of text."""
+        out = [f"{self.sequence['name']}: {self.sequence['num_frames']} frames"]
+        for name, stage in self.stages.items():
+            resumed = " (resumed)" if stage.get("resumed") else ""
+            out.append(f"{name}{resumed}: {stage.get('seconds', 0.0):.1f} s, {stage.get('peak_memory_mb', 0):.0f} MB")
+            for solve in stage.get("solves", [])[-1:]:
+                out.append(
+                    f"    energy {solve['initial_energy']:.4g} -> {solve['final_energy']:.4g} in "
+                    f"{solve['num_iterations']} iterations, {solve['termination']}"
+                )
+            out += [f"    {text}" for text in stage.get("facts", [])]
+            dropped = {reason: n for reason, n in stage.get("dropped", {}).items() if n}
+            out += [f"    dropped: {n} x {reason}" for reason, n in dropped.items()]
+        out += [f"warning: {text}" for text in self.warnings]
+        return out
+
+
+def solve_dict(summary: SolveSummary) -> dict[str, Any]:
+    """Return a solve's summary without its iteration log."""
+    data = summary.to_dict()
+    data["num_iterations"] = len(data.pop("iterations"))
+    return data
+
+
+def peak_memory_mb() -> float:
+    """Return the largest resident memory of this process so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0 * 1024.0) if sys.platform == "darwin" else peak / 1024.0
+
+
+def versions() -> dict[str, str]:
+    """Return the versions a result depends on."""
+    out = {"python": platform.python_version()}
+    for package in ("uni4d-fg", "gtsam", "numpy", "scipy", "opencv-python-headless", "open3d"):
+        try:
+            out[package] = version(package)
+        except PackageNotFoundError:
+            out[package] = "not installed"
+    return out
