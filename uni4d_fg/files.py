@@ -132,6 +132,15 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def json_text(value: Any) -> str:
+    """Return ``value`` as indented, strictly valid JSON; conversions as in :func:`atomic_write_json`.
+
+    Raises:
+        TypeError: If ``value`` holds something that JSON cannot express.
+    """
+    return json.dumps(_plain(value), indent=2, allow_nan=False)
+
+
 def atomic_write_json(path: Path, value: Any) -> None:
     """Write ``value`` to ``path`` as indented, strictly valid JSON, whole or not at all.
 
@@ -141,7 +150,7 @@ def atomic_write_json(path: Path, value: Any) -> None:
         OutputError: If it cannot be written.
         TypeError: If ``value`` holds something that JSON cannot express.
     """
-    atomic_write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+    atomic_write_text(path, json_text(value) + "\n")
 
 
 def save_npy(path: Path, array: npt.ArrayLike) -> None:
@@ -285,9 +294,7 @@ def _array_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], np.dt
         else:
             raise InputError(f"{where}: .npy format version {version} is not supported; save a plain array")
     except ValueError as error:
-        raise InputError(
-            f"{where}: its header is not that of a .npy array ({error}); write it again"
-        ) from error
+        raise InputError(f"{where}: its header is not that of a .npy array ({error}); write it again") from error
     if dtype.hasobject:
         raise InputError(
             f"{where}: holds Python objects, which are not loaded because reading them can run code; "
@@ -306,9 +313,7 @@ def _check_size(shape: tuple[int, ...], dtype: np.dtype[Any], available: int, wh
         )
 
 
-def _read_member(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, ndim: int | None
-) -> npt.NDArray[Any]:
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, ndim: int | None) -> npt.NDArray[Any]:
     name = info.filename.removesuffix(".npy")
     where = f"{path}: array {name!r}"
     with archive.open(info) as stream:

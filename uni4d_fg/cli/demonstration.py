@@ -1,0 +1,127 @@
+"""The demo: a synthetic scene, its reconstruction, and how accurate that is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from uni4d_fg.cli.progress import progress_reporter
+from uni4d_fg.cli.runs import DEMO_SEQUENCE, SequenceInput, is_run, remove_results
+from uni4d_fg.cli.scenes import SCENE_FILE, reuse_or_write_scene
+from uni4d_fg.errors import OutputError
+from uni4d_fg.evaluate.points import PointMetrics
+from uni4d_fg.evaluate.run import EvaluationReport
+from uni4d_fg.pipeline import RunSummary
+from uni4d_fg.reconstruction.io import load_reconstruction
+from uni4d_fg.reconstruction.model import Reconstruction
+from uni4d_fg.reconstruction.run_folder import RunFolder
+from uni4d_fg.sequence.model import Sequence
+from uni4d_fg.synthetic.config import SyntheticSceneConfig
+
+DEMO_SCENE = SyntheticSceneConfig(num_frames=24, width=320, height=240)
+FAST_SCENE = SyntheticSceneConfig(num_frames=10, width=160, height=120, focal=150.0, grid_columns=20, grid_rows=15)
+
+_FIRST_CAMERA = "first camera"
+
+
+def prepare_demo_folder(folder: Path, *, resume: bool) -> None:
+    """Make sure that the demo may be written to ``folder``; results of an earlier demo are removed.
+
+    Raises:
+        OutputError: If the folder holds anything but an earlier demo.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; choose another --out")
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    if not (folder / DEMO_SEQUENCE / SCENE_FILE).is_file():
+        what = "a run that is not the demo" if is_run(folder) else "something else"
+        raise OutputError(f"{folder}: holds {what}; choose another --out")
+    if not resume:
+        remove_results(folder)
+
+
+def demo_input(folder: Path, *, fast: bool, quiet: bool) -> SequenceInput:
+    """Make the demo's scene, unless it is there already, and return it as the input of a run.
+
+    Raises:
+        OutputError: If it cannot be written.
+        MissingDependencyError: If Open3D cannot be loaded.
+    """
+    root = folder / DEMO_SEQUENCE
+    with progress_reporter(quiet) as reporter:
+        reporter.begin("synthetic scene", None)
+        reused = reuse_or_write_scene(FAST_SCENE if fast else DEMO_SCENE, root)
+        reporter.end("the one of an earlier demo" if reused else "")
+    return SequenceInput(str(root.resolve()), "native")
+
+
+def demo_lines(folder: Path, sequence: Sequence, summary: RunSummary, report: EvaluationReport) -> list[str]:
+    """Return what the demo prints: the run, its accuracy, its files and the next commands."""
+    focal = focal_lengths(load_reconstruction(RunFolder(folder).reconstruction), sequence)
+    accuracy = [f"    {line}" for line in accuracy_lines(report, *focal)]
+    return [*summary.lines(), "", "accuracy against the exact truth", *accuracy, "", *result_lines(folder)]
+
+
+def accuracy_lines(report: EvaluationReport, focal: float, focal_cue: float, focal_true: float) -> list[str]:
+    """Return the accuracy of a demo run in a few lines."""
+    lines: list[str] = []
+    if report.trajectory is not None:
+        path = report.trajectory.path_length_reference_m
+        share = f", {100 * report.trajectory.ate_m / path:.2f} % of the path of {path:.2f} m" if path else ""
+        lines.append(f"camera path       ATE {_millimetres(report.trajectory.ate_m)}{share}")
+        lines.append(
+            f"                  RPE {_millimetres(report.trajectory.rpe_translation_m)}, "
+            f"{_number(report.trajectory.rpe_rotation_deg, '.3f')} deg per frame"
+        )
+    lines.append(
+        f"focal length      {_error(focal_cue, focal_true)} off at the start, {_error(focal, focal_true)} at the end"
+    )
+    moving = _observed(report.dynamic_points)
+    if moving is not None:
+        lines.append(f"dynamic points    RMSE {_millimetres(moving.rmse_m)} over {moving.points} observed points")
+    if report.depth is not None and report.depth_cue is not None:
+        cue, fused = (r.metrics["metric"].regions["all"].abs_rel for r in (report.depth_cue, report.depth))
+        lines.append(f"dense depth       AbsRel {_number(cue, '.4f')} of the cue, {_number(fused, '.4f')} after fusion")
+    return lines
+
+
+def result_lines(folder: Path) -> list[str]:
+    """Say where results lie and what to type next."""
+    run = RunFolder(folder)
+    named = (
+        (run.trajectory, "camera poses (TUM)"),
+        (run.reconstruction, "cameras, static points, 3D motion (NumPy)"),
+        (run.depth, "fused depth (NumPy)"),
+        (run.static_cloud, "static cloud; one cloud of the movers per frame in clouds/dynamic"),
+        (run.scene_picture, "rendered views"),
+    )
+    lines = ["results"]
+    lines += [f"    {path}  {text}" for path, text in named if path.exists()]
+    lines += ["next", f"    uni4d-fg evaluate {folder}", "    uni4d-fg validate YOUR_SEQUENCE"]
+    return lines
+
+
+def focal_lengths(reconstruction: Reconstruction, sequence: Sequence) -> tuple[float, float, float]:
+    """Return the focal length (mean of fx and fy) of the result, of the cue and of the truth, px."""
+    truth = sequence.ground_truth.intrinsics
+    known = (reconstruction.intrinsics, sequence.intrinsics, sequence.intrinsics if truth is None else truth)
+    result, cue, true = (float(intrinsics[:2].mean()) for intrinsics in known)
+    return result, cue, true
+
+
+def _observed(metrics: tuple[PointMetrics, ...] | None) -> PointMetrics | None:
+    """Return the score of observed points in the world of the first camera, which no scale can flatter."""
+    chosen = [m for m in metrics or () if m.protocol.startswith("observed") and _FIRST_CAMERA in m.protocol]
+    return chosen[0] if chosen and chosen[0].points else None
+
+
+def _error(value: float, truth: float) -> str:
+    return f"{100 * abs(value / truth - 1):.2f} %"
+
+
+def _millimetres(value: float | None) -> str:
+    return "-" if value is None else f"{1000 * value:.2f} mm"
+
+
+def _number(value: float | None, digits: str) -> str:
+    return "-" if value is None else format(value, digits)

@@ -1,0 +1,49 @@
+"""Verbs about results and settings: ``evaluate``, ``config``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from uni4d_fg.cli import options
+from uni4d_fg.cli.console import print_json
+from uni4d_fg.cli.options import LayoutChoice
+from uni4d_fg.cli.runs import SequenceInput, stored_input
+
+
+def evaluate(
+    run: options.RunPath,
+    sequence: Annotated[Path | None, typer.Option(help="Sequence with the ground truth, if not the run's.")] = None,
+    layout: options.Layout = LayoutChoice.auto,
+    depth: options.Depth = None,
+    depth_gt_scale: options.DepthScale = 1000.0,
+    max_depth: Annotated[float, typer.Option(help="Depth beyond this is not scored, m.", min=0.1)] = 70.0,
+    json: options.Json = False,
+) -> None:
+    """Score a run against the ground truth of its sequence."""
+    from uni4d_fg.evaluate.run import evaluate_run
+    from uni4d_fg.evaluate.table import format_report
+
+    source = stored_input(run)
+    if sequence is not None:
+        source = SequenceInput.of(
+            sequence, layout, depth, None, None, depth_gt_scale=depth_gt_scale, known_intrinsics=False
+        )
+    report = evaluate_run(run, source.read(), max_depth_m=max_depth)
+    if json:
+        print_json(report.to_dict())
+    else:
+        typer.echo(format_report(report), nl=False)
+
+
+def config(
+    config: options.ConfigChoice = None,
+    preset: Annotated[str | None, typer.Option(help="The same as --config.", show_default=False)] = None,
+    changes: options.Overrides = None,
+) -> None:
+    """Print every field of a configuration, as it would be used."""
+    from uni4d_fg.config.load import dump_config, load_config
+
+    typer.echo(dump_config(load_config(config or preset, changes or ())), nl=False)

@@ -1,0 +1,68 @@
+"""Synthetic scenes as folders."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from uni4d_fg.config.load import dump_config, with_overrides
+from uni4d_fg.errors import OutputError
+from uni4d_fg.files import atomic_write_text
+from uni4d_fg.sequence.model import Sequence as VideoSequence
+from uni4d_fg.sequence.write import write_native, write_uni4d
+from uni4d_fg.synthetic.config import SyntheticSceneConfig
+
+SCENE_FILE = "scene.yaml"
+
+
+def scene_config(named: Mapping[str, Any], changes: Sequence[str]) -> SyntheticSceneConfig:
+    """Return the default scene with named options (None: not given) and ``FIELD=VALUE`` changes applied.
+
+    Raises:
+        ConfigError: If a field is unknown or a value not allowed.
+    """
+    given = [f"{name}={value}" for name, value in named.items() if value is not None]
+    return with_overrides(SyntheticSceneConfig(), [*given, *changes])
+
+
+def write_scene(scene: SyntheticSceneConfig, folder: Path, layout: str = "native") -> VideoSequence:
+    """Make a scene and write it, with its parameters in ``scene.yaml``.
+
+    Raises:
+        OutputError: If the folder is in the way or cannot be written.
+        MissingDependencyError: If Open3D cannot be loaded.
+    """
+    from uni4d_fg.synthetic.simulate import make_synthetic_sequence
+
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise OutputError(f"cannot write {folder}: it exists already; remove it or choose another folder")
+    sequence = make_synthetic_sequence(scene)
+    write = write_uni4d if layout == "uni4d" else write_native
+    write(sequence, folder)
+    atomic_write_text(folder / SCENE_FILE, dump_config(scene))
+    return sequence
+
+
+def reuse_or_write_scene(scene: SyntheticSceneConfig, folder: Path) -> bool:
+    """Make sure that ``folder`` holds this scene in the native layout; another synthetic scene is replaced.
+
+    Returns:
+        Whether the scene that was there was of the same parameters and is used again.
+
+    Raises:
+        OutputError: If the folder holds anything else, or cannot be written.
+    """
+    if (folder / SCENE_FILE).is_file():
+        try:
+            known = yaml.safe_load((folder / SCENE_FILE).read_text(encoding="utf-8"))
+        except (yaml.YAMLError, OSError, ValueError):
+            known = None
+        if known == scene.model_dump(mode="json"):
+            return True
+        shutil.rmtree(folder)
+    write_scene(scene, folder)
+    return False

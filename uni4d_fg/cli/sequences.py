@@ -1,0 +1,96 @@
+"""Verbs about sequences: ``validate``, ``track``, ``synthesize``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from uni4d_fg.cli import options
+from uni4d_fg.cli.console import print_json, validation_text
+from uni4d_fg.cli.interruption import Interruption
+from uni4d_fg.cli.options import LayoutChoice
+from uni4d_fg.cli.progress import progress_reporter
+from uni4d_fg.cli.runs import SequenceInput
+from uni4d_fg.errors import InputError, OutputError
+
+
+def validate(
+    seq: options.SequenceFolder,
+    layout: options.Layout = LayoutChoice.auto,
+    depth: options.Depth = None,
+    masks: options.Masks = None,
+    tracks: options.Tracks = None,
+    depth_gt_scale: options.DepthScale = 1000.0,
+    known_intrinsics: options.KnownIntrinsics = False,
+    json: options.Json = False,
+) -> None:
+    """Check a sequence: what is there, what is wrong, what to do. Exit code 3 if it cannot be used."""
+    from uni4d_fg.sequence.validate import validate_sequence
+
+    source = SequenceInput.of(
+        seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics
+    )
+    report = validate_sequence(seq, **source.arguments())
+    if json:
+        print_json(report.to_dict())
+    else:
+        typer.echo(validation_text(report))
+    if not report.ok:
+        raise typer.Exit(InputError.exit_code)
+
+
+def track(
+    seq: options.SequenceFolder,
+    out: Annotated[Path | None, typer.Option(help="Track file; SEQ/tracks.npz if not given.")] = None,
+    config: options.ConfigChoice = None,
+    changes: options.Overrides = None,
+    layout: options.Layout = LayoutChoice.auto,
+    depth: options.Depth = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Track points through a video with the built-in tracker and write them to a file."""
+    from uni4d_fg.config.load import load_config
+    from uni4d_fg.sequence.read import read_sequence
+    from uni4d_fg.tracks.io import save_tracks
+    from uni4d_fg.tracks.lucas_kanade import track_grid
+
+    path = out or seq / "tracks.npz"
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; replace it with --overwrite or choose another --out")
+    settings = load_config(config, changes or ()).tracking
+    sequence = read_sequence(seq, layout.value, depth=depth)
+    with progress_reporter(quiet) as reporter, Interruption() as stop:
+        reporter.begin("tracking", 2 * (sequence.num_frames - 1))
+        found = track_grid(sequence.images, settings, lambda done, _: reporter.advance(done), stop)
+        reporter.end()
+    save_tracks(path, found)
+    length = found.visible.sum() / max(found.num_tracks, 1)
+    typer.echo(f"{found.num_tracks} tracks, seen in {length:.1f} of {found.num_frames} frames on average: {path}")
+
+
+def synthesize(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to make.", show_default=False)],
+    frames: Annotated[int | None, typer.Option(help="Number of frames.", show_default=False)] = None,
+    width: Annotated[int | None, typer.Option(help="Image width, px.", show_default=False)] = None,
+    height: Annotated[int | None, typer.Option(help="Image height, px.", show_default=False)] = None,
+    path: Annotated[str | None, typer.Option(help="Camera: handheld, static, rotation or forward.")] = None,
+    objects: Annotated[str | None, typer.Option(help="Movers: none, rigid, deforming, both or all_dynamic.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the noise.", show_default=False)] = None,
+    changes: options.Overrides = None,
+    layout: options.Layout = LayoutChoice.native,
+    quiet: options.Quiet = False,
+) -> None:
+    """Make a moving scene with exact ground truth. All fields of --set are in docs/configuration.md."""
+    from uni4d_fg.cli.scenes import scene_config, write_scene
+
+    named = {"num_frames": frames, "width": width, "height": height, "path": path, "objects": objects, "seed": seed}
+    scene = scene_config(named, changes or ())
+    with progress_reporter(quiet) as reporter:
+        reporter.begin("synthetic scene", None)
+        sequence = write_scene(scene, out, layout.value)
+        reporter.end()
+    tracks = 0 if sequence.tracks is None else sequence.tracks.num_tracks
+    typer.echo(f"{sequence.num_frames} frames of {scene.width} x {scene.height} px, {tracks} tracks: {out}")
