@@ -18,9 +18,7 @@ from uni4d_fg.sequence.model import Sequence
 from uni4d_fg.synthetic.config import SyntheticSceneConfig
 
 DEMO_SCENE = SyntheticSceneConfig(num_frames=24, width=320, height=240)
-FAST_SCENE = SyntheticSceneConfig(num_frames=10, width=160, height=120, focal=150.0, grid_columns=20, grid_rows=15)
-
-_FIRST_CAMERA = "first camera"
+FAST_SCENE = SyntheticSceneConfig(num_frames=12, width=200, height=150, focal=188.0, grid_columns=24, grid_rows=18)
 
 
 def prepare_demo_folder(folder: Path, *, resume: bool) -> None:
@@ -65,20 +63,21 @@ def demo_lines(folder: Path, sequence: Sequence, summary: RunSummary, report: Ev
 def accuracy_lines(report: EvaluationReport, focal: float, focal_cue: float, focal_true: float) -> list[str]:
     """Return the accuracy of a demo run in a few lines."""
     lines: list[str] = []
-    if report.trajectory is not None:
-        path = report.trajectory.path_length_reference_m
-        share = f", {100 * report.trajectory.ate_m / path:.2f} % of the path of {path:.2f} m" if path else ""
-        lines.append(f"camera path       ATE {_millimetres(report.trajectory.ate_m)}{share}")
-        lines.append(
-            f"                  RPE {_millimetres(report.trajectory.rpe_translation_m)}, "
-            f"{_number(report.trajectory.rpe_rotation_deg, '.3f')} deg per frame"
-        )
+    path = report.trajectory
+    if path is not None:
+        length = path.path_length_reference_m
+        share = f", {100 * path.ate_m / length:.2f} % of the path of {length:.2f} m" if length else ""
+        lines.append(f"camera path       ATE {_millimetres(path.ate_m)}{share}")
+        rotation = "-" if path.rpe_rotation_deg is None else f"{path.rpe_rotation_deg:.3f} deg"
+        lines.append(f"                  RPE {_millimetres(path.rpe_translation_m)} and {rotation} per frame")
+        lines.append(f"scale             {_error(path.scale, 1.0)} off")
     lines.append(
         f"focal length      {_error(focal_cue, focal_true)} off at the start, {_error(focal, focal_true)} at the end"
     )
     moving = _observed(report.dynamic_points)
     if moving is not None:
-        lines.append(f"dynamic points    RMSE {_millimetres(moving.rmse_m)} over {moving.points} observed points")
+        errors = f"RMSE {_millimetres(moving.rmse_m)}, median {_millimetres(moving.median_m)}"
+        lines.append(f"dynamic points    {errors}, over {moving.points} observed points")
     if report.depth is not None and report.depth_cue is not None:
         cue, fused = (r.metrics["metric"].regions["all"].abs_rel for r in (report.depth_cue, report.depth))
         lines.append(f"dense depth       AbsRel {_number(cue, '.4f')} of the cue, {_number(fused, '.4f')} after fusion")
@@ -96,7 +95,8 @@ def result_lines(folder: Path) -> list[str]:
         (run.scene_picture, "rendered views"),
     )
     lines = ["results"]
-    lines += [f"    {path}  {text}" for path, text in named if path.exists()]
+    width = max(len(str(path)) for path, _ in named)
+    lines += [f"    {str(path):<{width}}  {text}" for path, text in named if path.exists()]
     lines += ["next", f"    uni4d-fg evaluate {folder}", "    uni4d-fg validate YOUR_SEQUENCE"]
     return lines
 
@@ -110,8 +110,8 @@ def focal_lengths(reconstruction: Reconstruction, sequence: Sequence) -> tuple[f
 
 
 def _observed(metrics: tuple[PointMetrics, ...] | None) -> PointMetrics | None:
-    """Return the score of observed points in the world of the first camera, which no scale can flatter."""
-    chosen = [m for m in metrics or () if m.protocol.startswith("observed") and _FIRST_CAMERA in m.protocol]
+    """Return the score of observed points under the alignment that the camera path is scored with."""
+    chosen = [m for m in metrics or () if m.protocol.startswith("observed") and "Sim(3)" in m.protocol]
     return chosen[0] if chosen and chosen[0].points else None
 
 

@@ -177,8 +177,7 @@ def _preset_path(name: str) -> Path:
         close = difflib.get_close_matches(name, preset_names(), n=1)
         meant = f"did you mean {close[0]}? " if close else ""
         raise ConfigError(
-            f"{name}: no such preset or file; {meant}The presets are {', '.join(preset_names())}; "
-            "the name of a file ends in .yaml"
+            f"{name}: no such preset or file; {meant}presets: {', '.join(preset_names())}; a file's name ends in .yaml"
         )
     return path
 
