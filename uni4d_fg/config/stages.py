@@ -144,8 +144,10 @@ class FusionConfig(Section):
         ge=1,
     )
     min_control_points: int = setting(8, "With fewer, the instance's pixels get the frame's scale alone.", ge=1)
-    max_log_scale: float = setting(
-        0.5, "Control scales farther than this from the frame's log-scale are discarded.", gt=0
+    max_scale_sigmas: float = setting(
+        2.5,
+        "Control scales farther than this many measured depth sigmas from the frame's log-scale are discarded.",
+        gt=0,
     )
     stride: int = setting(4, "Scales are interpolated on a grid of this spacing and bilinearly in between, px.", ge=1)
     edge_relative_gradient: float = setting(

@@ -44,6 +44,7 @@ def densify_frame(
     intrinsics: FloatArray,
     control: ControlPoints,
     frame_log_scale: float,
+    depth_sigma: float,
     config: FusionConfig,
 ) -> Float32Array:
     """Correct one frame's depth cue.
@@ -54,6 +55,7 @@ def densify_frame(
         intrinsics: (4,) px.
         control: Control points of this frame.
         frame_log_scale: The frame's own log-scale: used where an instance has too few control points.
+        depth_sigma: Standard deviation of the cue's log depth, from the static scene.
         config: Fusion.
 
     Returns:
@@ -62,7 +64,8 @@ def densify_frame(
     height, width = depth.shape
     out = depth * np.float32(np.exp(frame_log_scale))
     nodes = _grid(depth, intrinsics, config.stride)
-    plausible = np.isfinite(control.log_scale) & (np.abs(control.log_scale - frame_log_scale) <= config.max_log_scale)
+    limit = config.max_scale_sigmas * depth_sigma
+    plausible = np.isfinite(control.log_scale) & (np.abs(control.log_scale - frame_log_scale) <= limit)
     for label in np.unique(mask).tolist():
         mine = np.flatnonzero(plausible & (control.instance == label))
         if len(mine) < config.min_control_points:

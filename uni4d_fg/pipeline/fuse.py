@@ -50,9 +50,9 @@ def fuse_depth(
             if should_stop():
                 raise Cancelled("stopped during fusion; finished stages are kept, --resume continues from them")
             control = control_points(labelled, scene, motion, frame)
-            log_scale = float(scene["log_scale"][frame])
+            log_scale, sigma = float(scene["log_scale"][frame]), float(scene["noise"][1])
             depth, mask = sequence.depths[frame], sequence.masks[frame]
-            writer.write(frame, densify_frame(depth, mask, scene["intrinsics"], control, log_scale, config))
+            writer.write(frame, densify_frame(depth, mask, scene["intrinsics"], control, log_scale, sigma, config))
             reporter.advance(frame + 1)
 
 
