@@ -107,6 +107,12 @@ class NonRigidConfig(Section):
         True,
         "Estimate a track's points in the frames between its first and last observation in which it is hidden.",
     )
+    local_scale_neighbours: int = setting(
+        32,
+        "The depth cue at a moving point is scaled by the median over this many nearest static observations, where "
+        "that predicts better than the frame's scale; 0 always takes the frame's scale.",
+        ge=0,
+    )
     reprojection: bool = setting(True, "Use E_NR.")
     depth_prior: bool = setting(True, "Use the depth prior.")
     reprojection_sigma_px: float | None = setting(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.energy import static_energy
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
+from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.sequence.model import Sequence
@@ -24,8 +26,9 @@ from uni4d_fg.stages.bundle_adjustment import (
     adjust_bundle,
 )
 from uni4d_fg.stages.camera_init import initialize_cameras
+from uni4d_fg.stages.local_scale import predict_log_scale
 from uni4d_fg.stages.nonrigid import FrozenCameras, solve_nonrigid
-from uni4d_fg.stages.observations import observations_of, weigh_by_drift
+from uni4d_fg.stages.observations import Observations, observations_of, weigh_by_drift
 from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
 
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -153,10 +156,12 @@ def _without_landmarks(cameras: Arrays, config: Config) -> StageRecord:
 
 def nonrigid_step(labelled: LabelledTracks, scene: Arrays, config: Config, hooks: Hooks) -> StageRecord:
     """Stage 3; empty without dynamic tracks."""
+    observations, cameras = observations_of(labelled, TrackLabel.DYNAMIC), frozen_cameras(scene)
+    observations, cameras, facts = _correct_cue(observations, labelled, cameras, scene, config)
     result = solve_nonrigid(
-        observations_of(labelled, TrackLabel.DYNAMIC),
+        observations,
         labelled.instance.astype(np.int64),
-        frozen_cameras(scene),
+        cameras,
         config.nonrigid,
         unsquared=config.energy == "unsquared",
         normalization=config.normalization,
@@ -170,9 +175,28 @@ def nonrigid_step(labelled: LabelledTracks, scene: Arrays, config: Config, hooks
         "track": result.track,
         "instance": result.instance,
     }
-    facts = [f"{len(result.track)} trajectories of {len(np.unique(result.instance))} instances"]
+    facts.append(f"{len(result.track)} trajectories of {len(np.unique(result.instance))} instances")
     summary = {"solves": [solve_dict(s) for s in solves], "dropped": result.dropped, "facts": facts}
     return StageRecord(arrays, summary)
+
+
+def _correct_cue(
+    observations: Observations, labelled: LabelledTracks, cameras: FrozenCameras, scene: Arrays, config: Config
+) -> tuple[Observations, FrozenCameras, list[str]]:
+    """Scale the cue at dynamic observations by what the static scene around them says."""
+    if config.energy == "unsquared" or len(observations) == 0 or len(scene["landmarks"]) == 0:
+        return observations, cameras, []
+    static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
+    static = static.select(np.isin(static.track, scene["landmark_track"]))
+    _, row = static.rows()
+    z = world_to_camera(cameras.world_T_cam[static.frame], scene["landmarks"][row])[:, 2]
+    measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
+    neighbours = config.nonrigid.local_scale_neighbours
+    local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbours)
+    fact = f"depth cue scaled per {'neighbourhood' if local.is_local else 'frame'}, noise {100 * local.sigma:.1f} %"
+    observations = replace(observations, depth=observations.depth * np.exp(local.log_scale))
+    noise = replace(cameras.noise, depth_sigma=local.sigma)
+    return observations, replace(cameras, log_scale=np.zeros_like(cameras.log_scale), noise=noise), [fact]
 
 
 def frozen_cameras(scene: Arrays) -> FrozenCameras:
