@@ -11,6 +11,7 @@ from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.errors import SolverError
 from uni4d_fg.factors.family import FactorFamily
 from uni4d_fg.factors.kernels import Kernel
+from uni4d_fg.graph.keys import decode
 from uni4d_fg.graph.state import TANGENT_DIM, State
 
 
@@ -66,10 +67,24 @@ class FactorBatch:
         kernel: Kernel | None = None,
         term: str = "",
     ) -> FactorBatch:
-        """Build a batch, broadcasting scalar ``sigma`` and ``weight`` to all rows."""
+        """Build a batch, broadcasting scalar ``sigma`` and ``weight`` to all rows.
+
+        Raises:
+            SolverError: If a sigma is not positive, a weight is negative or a row is not a row of its group.
+        """
         n = len(slots[0].rows)
         sigma_array = np.broadcast_to(np.asarray(sigma, dtype=np.float64), np.shape(sigma) or (n,))
         weight_array = np.broadcast_to(np.asarray(weight, dtype=np.float64), (n,))
+        name = term or family.name
+        if not (np.isfinite(sigma_array) & (sigma_array > 0)).all():
+            raise SolverError(f"{name}: every sigma must be finite and positive")
+        if not (np.isfinite(weight_array) & (weight_array >= 0)).all():
+            raise SolverError(f"{name}: every weight must be finite and not negative")
+        for slot, group in zip(slots, family.variables, strict=False):
+            if slot.group != group:
+                raise SolverError(f"{name}: a slot reads {slot.group} where the family needs {group}")
+            if len(slot.rows) and slot.rows.min() < 0:
+                raise SolverError(f"{name}: a row of {group} is negative")
         return cls(family, slots, data or {}, sigma_array, weight_array, kernel or Kernel(), term)
 
     def __len__(self) -> int:
@@ -92,7 +107,7 @@ class FactorBatch:
 
     def gather(self, state: State) -> list[FloatArray]:
         """Return the variables of every row, one array per slot."""
-        return [state[s.group][s.rows] for s in self.slots]
+        return [np.take(state[s.group], s.rows, axis=0) for s in self.slots]
 
     def residual(self, state: State) -> FloatArray:
         """Return the raw residuals (N, d)."""
@@ -112,7 +127,8 @@ class FactorBatch:
         """Return ``sum_n weight_n rho(|r_n / sigma_n|)``."""
         if len(self) == 0:
             return 0.0
-        return float(np.dot(self.weight, self.kernel.rho(self.squared_norm(state))))
+        # Not np.dot: BLAS may spread it over threads, which costs more than it gains and changes the rounding.
+        return float(np.sum(self.weight * self.kernel.rho(self.squared_norm(state))))
 
     def linearize(self, state: State) -> tuple[FloatArray, list[FloatArray]]:
         """Return residuals (N, d) and Jacobians (N, d, dim) with noise, weight and kernel applied (IRLS).
@@ -121,7 +137,7 @@ class FactorBatch:
             SolverError: If a Jacobian has the wrong shape or anything is not finite; names the variables.
         """
         r, jacobians = self.family.linearize(*self.gather(state), **self.data)
-        self._check(r, jacobians, state)
+        self.check(r, jacobians, state)
         inverse_sigma = self._inverse_sigma()
         r = r * inverse_sigma
         scale = np.sqrt(self.weight * self.kernel.weight(np.einsum("nd,nd->n", r, r)))
@@ -129,8 +145,15 @@ class FactorBatch:
         row_scale = (inverse_sigma * scale[:, None])[:, :, None]
         return r, [jacobian * row_scale for jacobian in jacobians]
 
-    def _check(self, r: FloatArray, jacobians: list[FloatArray], state: State) -> None:
+    def check(self, r: FloatArray, jacobians: list[FloatArray], state: State) -> None:
+        """Check what the family's ``linearize`` returned; ``state`` names the variables.
+
+        Raises:
+            SolverError: If a shape is wrong or a value is not finite.
+        """
         n, d = len(self), self.family.residual_dim
+        if len(jacobians) != len(self.slots):
+            raise SolverError(f"{self.name}: {len(jacobians)} Jacobians for {len(self.slots)} variables")
         for slot, jacobian in zip(self.slots, jacobians, strict=True):
             expected = (n, d, TANGENT_DIM[slot.group])
             if jacobian.shape != expected:
@@ -147,12 +170,10 @@ class FactorBatch:
             return
         row = int(np.flatnonzero(~finite)[0])
         raise SolverError(
-            f"{self.name}: {int((~finite).sum())} of {n} factors are not finite; the first is on "
+            f"{self.name}: a factor is not finite (at least {int((~finite).sum())} of them); the first is on "
             f"{self.describe_row(row, state)}. Check the cue values of that observation."
         )
 
     def describe_row(self, row: int, state: State) -> str:
         """Return the decoded variables of one factor: "camera pose, frame 3 and landmark, track 17"."""
-        from uni4d_fg.graph.keys import decode
-
         return " and ".join(str(decode(state.key(s.group, int(s.rows[row])))) for s in self.slots)

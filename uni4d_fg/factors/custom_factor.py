@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.errors import SolverError
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import TANGENT_DIM, State, values_at
@@ -38,6 +39,9 @@ def to_factor_graph(
 
     Returns:
         A graph on the keys of :mod:`uni4d_fg.graph.keys`.
+
+    Raises:
+        SolverError: If a term does not read the group it is to be stacked by.
     """
     graph = gtsam.NonlinearFactorGraph()
     free = problem.free_rows()
@@ -52,6 +56,8 @@ def to_factor_graph(
 def _stacks(batch: FactorBatch, group: str | None) -> list[IntArray]:
     if group is None:
         return list(np.arange(len(batch)).reshape(-1, 1))
+    if all(s.group != group for s in batch.slots):
+        raise SolverError(f"{batch.name}: cannot be stacked by {group}, which it does not read")
     of_row = next(s.rows for s in batch.slots if s.group == group)
     order = np.argsort(of_row, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(of_row[order])) + 1) if len(order) else []
@@ -91,9 +97,12 @@ def _callback(
                 if (slot.group, row) in position:
                     current[i] = values_at(values, keys[position[slot.group, row]], slot.group)
             arguments.append(current[inverse])
-        r, blocks = batch.family.linearize(*arguments, **batch.data)
-        r, blocks = _robust_square_root(batch, r, blocks)
-        if jacobians is not None:
+        if jacobians is None:
+            r, _ = _robust_square_root(batch, batch.family.residual(*arguments, **batch.data), [])
+        else:
+            r, blocks = batch.family.linearize(*arguments, **batch.data)
+            batch.check(r, blocks, state)  # GTSAM would accept a wrong shape and a NaN
+            r, blocks = _robust_square_root(batch, r, blocks)
             rows, d = r.shape
             for i, (group, _) in enumerate(variables):
                 jacobians[i] = np.zeros((rows * d, TANGENT_DIM[group]), order="F")

@@ -14,6 +14,7 @@ import numpy as np
 
 from uni4d_fg.errors import SolverError
 from uni4d_fg.graph.keys import decode
+from uni4d_fg.solve.diagnosis import listing, undetermined
 from uni4d_fg.solve.objective import Step
 
 OrderingKind = Literal["colamd", "metis", "natural"]
@@ -40,6 +41,7 @@ class GraphObjective:
         elif ordering == "natural":
             ordering = _natural(graph)
         self.ordering = ordering
+        self._shapes_checked = False
 
     def energies(self, state: gtsam.Values) -> dict[str, float]:
         """Return the graph's error."""
@@ -50,8 +52,15 @@ class GraphObjective:
         return state.retract(delta)
 
     def linearize(self, state: gtsam.Values) -> GraphLinearization:
-        """Linearise every factor; raises SolverError naming the factor that is not finite."""
+        """Linearise every factor.
+
+        Raises:
+            SolverError: If a factor is not finite or its Jacobian has the wrong width; names its variables.
+        """
         gaussian = self.graph.linearize(state)
+        if not self._shapes_checked:
+            self._check_shapes(gaussian, _dimensions(state))
+            self._shapes_checked = True
         gradient = gaussian.gradientAtZero()
         keys = [key for key in list(state.keys()) if gradient.exists(key)]
         vector = gradient.vector(keys)
@@ -63,28 +72,54 @@ class GraphObjective:
         for i in range(self.graph.size()):
             factor = self.graph.at(i)
             if factor is not None and not math.isfinite(factor.error(state)):
-                names = ", ".join(str(decode(key)) for key in factor.keys())
+                names = " and ".join(str(decode(key)) for key in list(factor.keys()))
                 return f"{self.term}: factor {i} on {names} is not finite. Check the values it measures."
         return f"{self.term}: a Jacobian is not finite"
 
+    def _check_shapes(self, gaussian: gtsam.GaussianFactorGraph, dimension: dict[int, int]) -> None:
+        """Refuse Jacobians whose width is not the variable's: GTSAM itself computes on with them."""
+        for i in range(gaussian.size()):
+            factor = gaussian.at(i)
+            if factor is None:
+                continue
+            keys = list(factor.keys())
+            width, expected = _width(factor), sum(dimension[key] for key in keys)
+            if width != expected:
+                names = " and ".join(str(decode(key)) for key in keys)
+                raise SolverError(
+                    f"{self.term}: the Jacobian of factor {i} on {names} has {width} columns, not {expected}"
+                )
+
     def diagnose(self, state: gtsam.Values) -> str:
-        """Name the variables whose information is zero and the factors that touch them."""
+        """Name the variables whose own information is singular and the factors that touch them."""
         gaussian = self.graph.linearize(state)
-        names = []
-        for key in list(state.keys()):
-            touching = [i for i in range(self.graph.size()) if key in list(self.graph.at(i).keys())]
-            single = gtsam.GaussianFactorGraph()
-            for i in touching:
-                single.push_back(gaussian.at(i))
-            information = 0.0
-            if touching:
-                hessian, _ = single.hessian()
-                information = float(np.abs(np.diag(hessian)).min())
-            if information <= 1e-12:
-                names.append(f"{decode(key)} (factors: {touching or 'none'})")
-        if names:
-            return "Not determined: " + "; ".join(names[:5]) + ". Give it observations or a prior."
-        return "No single variable is undetermined: a gauge freedom remains; anchor a pose or the scale."
+        dimension = _dimensions(state)
+        blocks = {key: np.zeros((n, n)) for key, n in dimension.items()}
+        touching: dict[int, list[int]] = {key: [] for key in dimension}
+        for i in range(gaussian.size()):
+            factor = gaussian.at(i)
+            if factor is None:
+                continue
+            information, start = factor.information(), 0
+            for key in list(factor.keys()):
+                stop = start + dimension[key]
+                blocks[key] += information[start:stop, start:stop]
+                touching[key].append(i)
+                start = stop
+        weak = [key for key, block in blocks.items() if len(block) and len(undetermined(block[None]))]
+        described = [f"{decode(key)} (factors: {touching[key] or 'none'})" for key in weak[:5]]
+        return listing(described, len(weak))
+
+
+def _dimensions(state: gtsam.Values) -> dict[int, int]:
+    zero = state.zeroVectors()
+    return {key: len(zero.at(key)) for key in list(state.keys())}
+
+
+def _width(factor: gtsam.GaussianFactor) -> int:
+    if isinstance(factor, gtsam.JacobianFactor):
+        return int(factor.cols()) - 1
+    return len(factor.information())
 
 
 def _natural(graph: gtsam.NonlinearFactorGraph) -> gtsam.Ordering:
@@ -101,6 +136,7 @@ class GraphLinearization:
         self, gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: list[int], gradient: np.ndarray
     ):
         self.gaussian, self.ordering, self.keys, self.gradient = gaussian, ordering, keys, gradient
+        self._zero = gtsam.VectorValues.Zero(gaussian.gradientAtZero())
 
     @property
     def gradient_max(self) -> float:
@@ -111,7 +147,7 @@ class GraphLinearization:
         """Return the step of ``H + damping I`` (GTSAM's default damping), or None when it is singular."""
         damped = gtsam.GaussianFactorGraph()
         damped.push_back(self.gaussian)
-        zero = self.gaussian.gradientAtZero()
+        zero = self._zero
         root = math.sqrt(damping)
         for key in self.keys:
             n = len(zero.at(key))
@@ -123,9 +159,5 @@ class GraphLinearization:
         vector = np.asarray(delta.vector(self.keys))
         if not np.isfinite(vector).all():
             return None
-        decrease = float(self.gaussian.error(_zero_like(zero)) - self.gaussian.error(delta))
+        decrease = float(self.gaussian.error(zero) - self.gaussian.error(delta))
         return Step(delta, float(np.linalg.norm(vector)), max(decrease, 0.0))
-
-
-def _zero_like(values: gtsam.VectorValues) -> gtsam.VectorValues:
-    return gtsam.VectorValues.Zero(values)

@@ -19,25 +19,23 @@ With nothing to eliminate this is a dense normal-equation solver, as camera init
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import scipy.linalg
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.errors import SolverError
+from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.graph.keys import decode
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import State
 from uni4d_fg.solve.chunks import BatchPart, Chunk, plan_chunks
+from uni4d_fg.solve.diagnosis import GAUGE_MESSAGE, null_directions_message, undetermined, undetermined_message
 from uni4d_fg.solve.layout import DenseLayout
 from uni4d_fg.solve.objective import Step
-from uni4d_fg.solve.threads import one_blas_thread, thread_count
-
-ItemT = TypeVar("ItemT")
-ResultT = TypeVar("ResultT")
+from uni4d_fg.solve.threads import ItemT, ResultT, map_in_order, one_blas_thread, thread_count
 
 
 @dataclass(frozen=True)
@@ -74,14 +72,21 @@ class SchurObjective:
         """Plan the sparsity once; it does not change between linearisations.
 
         Args:
-            problem: Batches and free entries. A row of the eliminated group is free as a whole or frozen.
+            problem: Batches and free entries. A factor reads at most one row of the eliminated group; a row of
+                that group is free as a whole or frozen.
             state: Any state of the problem (only array lengths are read).
             config: Bounds of the damping diagonal.
             eliminate: Group of 3-vectors to eliminate; None, or a frozen group, eliminates nothing.
             threads: Worker threads; the number of cores when None.
+
+        Raises:
+            SolverError: If a factor reads two rows of the eliminated group.
         """
         self.problem, self.config = problem, config
         self.eliminate = eliminate if eliminate is not None and problem.is_free(eliminate) else None
+        for batch in problem.batches:
+            if self.eliminate is not None and sum(s.group == self.eliminate for s in batch.slots) > 1:
+                raise SolverError(f"{batch.name}: reads several {self.eliminate} rows; they cannot be eliminated")
         groups = tuple(g for g in problem.free if problem.is_free(g) and g != self.eliminate)
         self.layout = DenseLayout.create(state, problem.free, groups)
         self.num_landmarks = len(state[self.eliminate]) if self.eliminate else 0
@@ -89,23 +94,29 @@ class SchurObjective:
         if self.eliminate is not None:
             self.landmark_free = np.asarray(problem.free[self.eliminate].all(axis=1))
         self.chunks = plan_chunks(problem, self.layout, self.eliminate, self.num_landmarks)
+        self._constant = self._constant_batches()
         self.threads = min(thread_count(threads), max(len(self.chunks), 1))
         # E is by far the largest array: allocated once, overwritten by every linearisation.
         self._coupling = [
-            [np.zeros((len(chunk.landmarks), span.count, span.dim, 3)) for span in chunk.spans]
-            for chunk in self.chunks
+            [np.zeros((len(chunk.landmarks), span.count, span.dim, 3)) for span in chunk.spans] for chunk in self.chunks
         ]
+
+    def _constant_batches(self) -> list[FactorBatch]:
+        """Return the factors that no chunk holds because nothing they read may move."""
+        out = []
+        for batch in self.problem.batches:
+            if any(s.group in self.layout.offset for s in batch.slots):
+                continue
+            landmark = next((s.rows for s in batch.slots if s.group == self.eliminate), None)
+            out.append(batch if landmark is None else batch.take(np.flatnonzero(~self.landmark_free[landmark])))
+        return out
 
     def energies(self, state: State) -> dict[str, float]:
         """Return the energy per term."""
-        parts = [part for chunk in self.chunks for part in chunk.parts]
-        planned = self._map(lambda part: part.batch.energy(state), parts)
+        parts = [part.batch for chunk in self.chunks for part in chunk.parts] + self._constant
         out = {batch.name: 0.0 for batch in self.problem.batches}
-        for part, energy in zip(parts, planned, strict=True):
-            out[part.batch.name] += energy
-        for batch in self.problem.batches:
-            if not any(s.group in self.layout.offset or s.group == self.eliminate for s in batch.slots):
-                out[batch.name] += batch.energy(state)
+        for batch, energy in zip(parts, self._map(lambda batch: batch.energy(state), parts), strict=True):
+            out[batch.name] += energy
         return out
 
     def retract(self, state: State, delta: dict[str, FloatArray]) -> State:
@@ -120,32 +131,30 @@ class SchurObjective:
 
     def _map(self, function: Callable[[ItemT], ResultT], items: list[ItemT]) -> list[ResultT]:
         """Apply a function to every item on the worker threads; results in the order of the items."""
-        if self.threads == 1 or len(items) < 2:
-            return [function(item) for item in items]
-        with one_blas_thread(), ThreadPoolExecutor(self.threads) as pool:
-            return list(pool.map(function, items))
+        return map_in_order(function, items, self.threads)
 
     def diagnose(self, state: State) -> str:
-        """Name the free variables that no factor determines."""
-        diagonal = np.diag(self.linearize(state).hessian)
-        weak = np.flatnonzero(self.layout.free & ~(diagonal > 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-300)))
-        names = []
-        for column in weak[:5].tolist():
-            group, row, _ = self.layout.locate(column)
-            terms = {
-                batch.name
-                for batch in self.problem.batches
-                for slot in batch.slots
-                if slot.group == group and (slot.rows == row).any()
-            }
-            names.append(f"{decode(state.key(group, row))} (factors: {', '.join(sorted(terms)) or 'none'})")
-        if names:
-            listed = "; ".join(dict.fromkeys(names))
-            return f"Not determined: {listed}. Give it observations or a prior, or freeze it."
-        return (
-            "No single variable is undetermined: a gauge freedom or parallel constraints remain; "
-            "anchor a pose or the scale."
-        )
+        """Name the free variables that no factor determines, or the directions that stay free together."""
+        linearization = self.linearize(state)
+        variables: list[tuple[str, int]] = []
+        for group, count in self.layout.count.items():
+            columns = self.layout.columns(group, np.arange(count))
+            blocks = linearization.hessian[columns[:, :, None], columns[:, None, :]]
+            variables += [(group, row) for row in undetermined(blocks, self.layout.free[columns]).tolist()]
+        if self.eliminate is not None:
+            blocks = np.tile(np.eye(3), (self.num_landmarks, 1, 1))
+            for chunk, block in zip(self.chunks, linearization.blocks, strict=True):
+                blocks[chunk.landmarks] = block.point_hessian
+            variables += [(self.eliminate, row) for row in undetermined(blocks).tolist()]
+        if variables:
+            return undetermined_message(self.problem, state, variables)
+        reduced = linearization.reduced(0.0)
+        free = np.flatnonzero(self.layout.free)
+        if reduced is None:
+            return GAUGE_MESSAGE
+        names = [str(decode(state.key(*self.layout.locate(column)[:2]))) for column in free.tolist()]
+        message = null_directions_message(reduced[0][np.ix_(free, free)], np.diag(linearization.hessian)[free], names)
+        return message or GAUGE_MESSAGE
 
 
 def _linearize_chunk(chunk: Chunk, state: State, coupling: list[FloatArray]) -> _ChunkBlocks:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
 
 
 @cache
@@ -29,3 +34,15 @@ def thread_count(requested: int | None = None) -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS and Windows
         return os.cpu_count() or 1
+
+
+def map_in_order(function: Callable[[ItemT], ResultT], items: list[ItemT], threads: int) -> list[ResultT]:
+    """Apply a function to every item on worker threads; results in the order of the items.
+
+    BLAS is limited to one thread even when ``threads`` is 1, so that its sums do not depend on that number.
+    """
+    with one_blas_thread():
+        if threads == 1 or len(items) < 2:
+            return [function(item) for item in items]
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(function, items))
