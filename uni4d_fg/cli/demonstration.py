@@ -96,7 +96,7 @@ def result_lines(folder: Path) -> list[str]:
     )
     lines = ["results"]
     width = max(len(str(path)) for path, _ in named)
-    lines += [f"    {str(path):<{width}}  {text}" for path, text in named if path.exists()]
+    lines += [f"    {path!s:<{width}}  {text}" for path, text in named if path.exists()]
     lines += ["next", f"    uni4d-fg evaluate {folder}", "    uni4d-fg validate YOUR_SEQUENCE"]
     return lines
 

@@ -1,0 +1,295 @@
+"""Every verb through the one entry point: exit code, standard output, standard error."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from uni4d_fg.cli import demonstration, main, reconstruction
+from uni4d_fg.config.load import load_config
+from uni4d_fg.errors import Cancelled, SolverError
+from uni4d_fg.files import load_npz, save_npy
+from uni4d_fg.synthetic import SyntheticSceneConfig
+from uni4d_fg.tracks.io import load_tracks
+
+pytest.importorskip("open3d")
+
+Run = Callable[..., tuple[int, str, str]]
+
+TINY_SCENE = SyntheticSceneConfig(num_frames=8, width=128, height=96, focal=120.0, grid_columns=20, grid_rows=15)
+SCENE_OPTIONS = [
+    "--frames", "8", "--width", "128", "--height", "96", "--set", "focal=120", "--set", "grid_columns=20",
+    "--set", "grid_rows=15",
+]  # fmt: skip
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Run:
+    def run(*words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main.run([str(word) for word in words])
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return code, out, err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scene") / "room"
+    assert main.run(["synthesize", str(folder), "--quiet", *SCENE_OPTIONS]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "room"
+    words = ["reconstruct", str(scene), "--out", str(run), "--config", "fast", "--quiet"]
+    assert main.run(words) == 0
+    return run
+
+
+def test_help_names_every_verb(cli: Run) -> None:
+    code, out, _ = cli("--help")
+    assert code == 0
+    for verb in ("demo", "validate", "track", "reconstruct", "evaluate", "synthesize", "config"):
+        assert verb in out
+        assert cli(verb, "--help")[0] == 0
+
+
+def test_version(cli: Run) -> None:
+    code, out, _ = cli("--version")
+    assert (code, out.split()[0]) == (0, "uni4d-fg")
+
+
+@pytest.mark.parametrize("words", [["nosuch"], ["reconstruct"], ["validate", "a", "b"], ["evaluate", "--nosuch"]])
+def test_a_wrong_command_line_exits_with_2(cli: Run, words: list[str]) -> None:
+    code, out, err = cli(*words)
+    assert (code, out) == (2, "")
+    assert "Usage" in err
+
+
+def test_config_prints_the_whole_configuration(cli: Run, tmp_path: Path) -> None:
+    code, out, _ = cli("config", "--preset", "paper", "--set", "seed=4")
+    assert code == 0
+    assert yaml.safe_load(out) == load_config("paper", ["seed=4"]).model_dump(mode="json")
+    (tmp_path / "c.yaml").write_text(out)
+    assert cli("config", "--config", tmp_path / "c.yaml")[1] == out
+
+
+def test_a_configuration_error_is_one_line_and_exits_with_2(cli: Run) -> None:
+    code, out, err = cli("config", "--set", "camera_init.windw=3")
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert err.startswith("error: ")
+    assert "camera_init.window?" in err
+
+
+def test_synthesize_writes_a_readable_sequence_with_its_parameters(cli: Run, scene: Path) -> None:
+    parameters = yaml.safe_load((scene / "scene.yaml").read_text())
+    assert parameters == TINY_SCENE.model_dump(mode="json")
+    code, out, _ = cli("validate", scene)
+    assert code == 0
+    assert "can be reconstructed" in out
+    for item in ("images", "depth", "masks", "intrinsics", "tracks", "true poses"):
+        assert item in out
+
+
+def test_synthesize_in_the_other_layout(cli: Run, tmp_path: Path) -> None:
+    words = ["synthesize", tmp_path / "u", "--layout", "uni4d", "--frames", 2, *SCENE_OPTIONS[2:], "--quiet"]
+    assert cli(*words)[0] == 0
+    code, out, _ = cli("validate", tmp_path / "u", "--json")
+    report = json.loads(out)
+    assert (code, report["layout"], report["ok"]) == (0, "uni4d", True)
+
+
+def test_synthesize_refuses_what_is_in_the_way_and_wrong_values(cli: Run, scene: Path, tmp_path: Path) -> None:
+    code, _, err = cli("synthesize", scene)
+    assert code == 6
+    assert "exists already" in err
+    code, _, err = cli("synthesize", tmp_path / "s", "--path", "sideways")
+    assert code == 2
+    assert "handheld" in err
+    assert not (tmp_path / "s").exists()
+
+
+def test_validate_lists_findings_with_remedies_and_exits_with_3(cli: Run, scene: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    (broken / "rgb").mkdir(parents=True)
+    for path in (scene / "rgb").iterdir():
+        (broken / "rgb" / path.name).symlink_to(path)
+    save_npy(broken / "depth_cue.npy", np.ones((3, 96, 128), np.float32))
+    code, out, _ = cli("validate", broken)
+    assert code == 3
+    assert "error: depth" in out
+    assert "to do: " in out
+    assert "cannot be reconstructed" in out
+    code, out, _ = cli("validate", broken, "--json")
+    assert (code, json.loads(out)["ok"]) == (3, False)
+
+
+@pytest.mark.parametrize("verb", ["validate", "reconstruct", "track", "evaluate"])
+def test_a_missing_folder_exits_with_3(cli: Run, verb: str, tmp_path: Path) -> None:
+    code, out, err = cli(verb, tmp_path / "nosuch")
+    assert code == 3
+    assert "no such folder" in out + err
+
+
+def test_track_writes_a_file_and_does_not_replace_one(cli: Run, scene: Path, tmp_path: Path) -> None:
+    path = tmp_path / "tracks.npz"
+    words = ["track", scene, "--out", path, "--set", "tracking.grid_columns=8", "--set", "tracking.grid_rows=6"]
+    code, out, err = cli(*words)
+    assert code == 0
+    assert str(path) in out
+    assert "tracking: " in err
+    tracks = load_tracks(path)
+    assert tracks.num_frames == 8
+    assert out.startswith(f"{tracks.num_tracks} tracks")
+    code, _, err = cli(*words)
+    assert code == 6
+    assert "--overwrite" in err
+    assert cli(*words, "--overwrite", "--quiet")[2] == ""
+    assert cli("track", scene)[0] == 6  # the sequence has tracks of its own
+
+
+def test_reconstruct_leaves_a_run_folder(finished: Path, scene: Path) -> None:
+    for name in ("reconstruction.npz", "trajectory.tum", "depth.npy", "summary.json", "labels.npz", "config.yaml"):
+        assert (finished / name).is_file(), name
+    assert load_config(finished / "config.yaml") == load_config("fast")
+    assert json.loads((finished / "input.json").read_text())["root"] == str(scene)
+    assert len(load_npz(finished / "reconstruction.npz", {"world_T_cam": 3})["world_T_cam"]) == 8
+
+
+def test_a_run_is_not_overwritten_by_accident(cli: Run, finished: Path, scene: Path, tmp_path: Path) -> None:
+    code, _, err = cli("reconstruct", scene, "--out", finished)
+    assert code == 6
+    assert "--resume" in err
+    assert "--overwrite" in err
+    assert cli("reconstruct", scene, "--out", finished, "--resume", "--overwrite")[0] == 6
+    (tmp_path / "thesis.txt").write_text("mine")
+    for option in ([], ["--resume"], ["--overwrite"]):
+        code, _, err = cli("reconstruct", scene, "--out", tmp_path, *option)
+        assert code == 6
+        assert "holds no run" in err
+    assert (tmp_path / "thesis.txt").read_text() == "mine"
+    assert cli("reconstruct", scene, "--out", tmp_path / "thesis.txt")[0] == 6
+
+
+def test_resume_takes_finished_stages_over(cli: Run, finished: Path, scene: Path) -> None:
+    code, out, _ = cli("reconstruct", scene, "--out", finished, "--config", "fast", "--resume", "--quiet", "--json")
+    assert code == 0
+    stages = json.loads(out)["stages"]
+    assert all(stages[name]["resumed"] for name in ("tracks", "camera_init", "bundle_adjustment", "nonrigid"))
+
+
+def test_overwrite_replaces_results_and_nothing_else(cli: Run, scene: Path, tmp_path: Path) -> None:
+    words = ["reconstruct", scene, "--out", tmp_path, "--config", "fast"]
+    assert cli(*words, "--quiet")[0] == 0
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "clouds" / "stale.ply").write_text("old")
+    code, out, err = cli(*words, "--overwrite", "--set", "output.clouds=false")
+    assert code == 0
+    assert f"results: {tmp_path}" in out
+    assert "bundle adjustment: " in err
+    assert (tmp_path / "notes.txt").exists()
+    assert not (tmp_path / "clouds").exists()
+
+
+def test_an_unusable_sequence_does_not_cost_an_earlier_run(cli: Run, finished: Path, tmp_path: Path) -> None:
+    assert cli("reconstruct", tmp_path / "nosuch", "--out", finished, "--overwrite")[0] == 3
+    assert (finished / "reconstruction.npz").exists()
+
+
+def test_evaluate_finds_the_sequence_of_the_run(cli: Run, finished: Path, scene: Path) -> None:
+    code, out, _ = cli("evaluate", finished)
+    assert code == 0
+    assert "ATE" in out
+    code, out, _ = cli("evaluate", finished, "--sequence", scene, "--json")
+    report = json.loads(out)
+    assert (code, report["frames"]) == (0, 8)
+    assert report["trajectory"]["ate_m"] < 0.1
+
+
+def test_evaluate_falls_back_to_the_summary_and_says_what_is_missing(cli: Run, finished: Path, tmp_path: Path) -> None:
+    for name in ("reconstruction.npz", "labels.npz", "summary.json"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    assert cli("evaluate", tmp_path)[0] == 0
+    (tmp_path / "summary.json").write_text('{"sequence": {"root": null}}')
+    code, _, err = cli("evaluate", tmp_path)
+    assert code == 3
+    assert "--sequence" in err
+    for text in ("{", "[]", '{"sequence": 3}', '{"sequence": {"root": 7}}', "\x00"):
+        (tmp_path / "summary.json").write_text(text)
+        assert cli("evaluate", tmp_path)[0] == 3
+    (tmp_path / "summary.json").unlink()
+    code, _, err = cli("evaluate", tmp_path)
+    assert code == 3
+    assert "summary.json" in err
+
+
+def test_demo_reports_its_accuracy_and_reuses_its_scene(
+    cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demonstration, "FAST_SCENE", TINY_SCENE)
+    folder = tmp_path / "demo"
+    code, out, err = cli("demo", "--fast", "--out", folder)
+    assert code == 0
+    for text in ("ATE", "RPE", "focal length", "dynamic points", "AbsRel", "uni4d-fg evaluate"):
+        assert text in out
+    assert "earlier demo" not in err
+    image = folder / "sequence" / "rgb" / "00000.png"
+    written = image.stat().st_mtime_ns
+    code, out, err = cli("demo", "--fast", "--out", folder, "--json")
+    assert code == 0
+    assert set(json.loads(out)) == {"summary", "evaluation"}
+    assert "earlier demo" in err
+    assert image.stat().st_mtime_ns == written
+    monkeypatch.setattr(demonstration, "FAST_SCENE", TINY_SCENE.model_copy(update={"seed": 1}))
+    assert cli("demo", "--fast", "--out", folder, "--quiet")[0] == 0
+    assert image.stat().st_mtime_ns != written
+
+
+def test_demo_leaves_other_folders_alone(cli: Run, finished: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    for folder in (tmp_path, tmp_path / "thesis.txt", finished):
+        code, _, err = cli("demo", "--fast", "--out", folder)
+        assert code == 6
+        assert "--out" in err
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "kind"),
+    [
+        (SolverError("bundle adjustment:\nsingular"), 5, "error: bundle adjustment: singular\n"),
+        (Cancelled("stopped"), 130, "stopped: "),
+        (ZeroDivisionError("by zero"), 70, "error: unexpected ZeroDivisionError: by zero; please report"),
+    ],
+)
+def test_what_goes_wrong_inside_is_one_line(
+    cli: Run, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int, kind: str
+) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(reconstruction, "run_pipeline", fail)
+    got, out, err = cli("reconstruct", scene, "--out", tmp_path / "r")
+    assert (got, out) == (code, "")
+    assert err.startswith(kind)
+    assert err.count("\n") == 1
+
+
+def test_debug_shows_the_traceback(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(reconstruction, "run_pipeline", fail)
+    assert main.run(["reconstruct", str(scene), "--out", str(tmp_path / "r"), "--debug"]) == 70
+    assert "Traceback" in capsys.readouterr().err

@@ -1,0 +1,226 @@
+"""Presets, files, overrides, and the message of every kind of mistake."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uni4d_fg.config import Config
+from uni4d_fg.config.describe import describe_fields, field_paths, find_field
+from uni4d_fg.config.load import dump_config, load_config, preset_names, presets_folder, with_overrides
+from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.errors import ConfigError
+from uni4d_fg.synthetic import SyntheticSceneConfig
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_default_preset_is_the_models_defaults() -> None:
+    assert load_config() == load_config("default") == Config()
+
+
+@pytest.mark.parametrize("name", ["default", "fast", "paper"])
+def test_presets_are_valid_and_known(name: str) -> None:
+    assert name in preset_names()
+    assert (presets_folder() / f"{name}.yaml").is_file()
+    assert dump_config(load_config(name))
+
+
+def test_the_paper_preset_has_the_numbers_of_the_reference_program() -> None:
+    config = load_config("paper")
+    assert (config.energy, config.normalization) == ("unsquared", "mean")
+    assert config.camera_init.window == 5
+    assert config.camera_init.max_tracks_per_pair == 0
+    for motion in (config.camera_init.camera_motion, config.bundle_adjustment.camera_motion):
+        assert (motion.rotation_weight, motion.translation_weight) == (1.0, 1.0)
+    assert not config.bundle_adjustment.depth_prior
+    assert not config.nonrigid.depth_prior
+    assert (config.nonrigid.neighbours, config.nonrigid.smoothness_order) == (4, 1)
+    assert (config.nonrigid.smoothness_weight, config.nonrigid.arap_weight) == (10.0, 100.0)
+    assert config.nonrigid.annealing[-1] == 1.0
+    assert config.labels.min_static_fraction == 0.2
+    for kernel in (
+        config.camera_init.kernel,
+        config.bundle_adjustment.reprojection_kernel,
+        config.nonrigid.reprojection_kernel,
+        config.nonrigid.smoothness_kernel,
+        config.nonrigid.arap_kernel,
+    ):
+        assert kernel.kind == "norm"
+
+
+@pytest.mark.parametrize("name", ["default", "fast", "paper"])
+def test_a_dumped_configuration_reads_back_the_same(name: str, tmp_path: Path) -> None:
+    config = load_config(name, ["seed=7", "nonrigid.annealing=[8, 1]"])
+    path = write(tmp_path / "config.yaml", dump_config(config))
+    assert load_config(path) == config
+    assert load_config(str(path)) == config
+    assert yaml.safe_load(dump_config(config)) == config.model_dump(mode="json")
+
+
+def test_a_file_holds_only_what_it_changes(tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.yaml", "tracking:\n  query_interval: 4\ncamera_init:\n")
+    assert load_config(path) == with_overrides(Config(), ["tracking.query_interval=4"])
+
+
+def test_a_section_keeps_what_its_parent_gave_it(tmp_path: Path) -> None:
+    # The solver of camera_init stops after other iterations than the solver section's own default.
+    path = write(tmp_path / "mine.yaml", "camera_init: {solver: {max_damping: 1.0e+8}}\n")
+    solver = load_config(path).camera_init.solver
+    assert solver.max_iterations == Config().camera_init.solver.max_iterations != SolverConfig().max_iterations
+
+
+def test_a_file_names_its_preset_and_overrides_come_last(tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.yaml", "preset: paper\nnonrigid:\n  neighbours: 5\n  arap_weight: 50.0\n")
+    config = load_config(path, ["nonrigid.neighbours=6"])
+    assert (config.nonrigid.neighbours, config.nonrigid.arap_weight, config.energy) == (6, 50.0, "unsquared")
+
+
+def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
+    assert load_config(write(tmp_path / "empty.yaml", "# nothing\n")) == Config()
+
+
+def test_a_preset_wins_over_a_file_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fast").mkdir()
+    assert load_config("fast").tracking.grid_columns == 30
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("bundle_adjustment.depth_sigma=1e-3", 1e-3),
+        ("bundle_adjustment.depth_sigma=2E-2", 2e-2),
+        ("bundle_adjustment.depth_sigma=.5", 0.5),
+        ("bundle_adjustment.depth_sigma=1", 1.0),
+        ("nonrigid.depth_sigma=null", None),
+        ("nonrigid.bridge_gaps=false", False),
+        ("nonrigid.annealing=[10, 1]", (10.0, 1.0)),
+        ("energy=unsquared", "unsquared"),
+        (" camera_init . window = 7", 7),
+    ],
+)
+def test_override_values_are_yaml(override: str, expected: object) -> None:
+    value: object = load_config(None, [override])
+    for name in override.partition("=")[0].split("."):
+        value = getattr(value, name.strip())
+    assert value == expected
+
+
+def test_an_override_can_give_a_whole_section() -> None:
+    config = load_config(None, ["nonrigid={arap_weight: 3, solver: {max_iterations: 4}}"])
+    assert config.nonrigid.solver.max_iterations == 4
+    assert config.nonrigid.neighbours == Config().nonrigid.neighbours
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("camera_init.windw=3", ["--set", "camera_init.windw", "unknown field", "camera_init.window?"]),
+        ("window=3", ["window: unknown field", "camera_init.window?"]),
+        ("zzz.qqq=3", ["zzz.qqq: unknown field", "closest"]),
+        ("seed.x=3", ["seed.x: unknown field"]),
+        ("output={cloud: true}", ["output.cloud: unknown field", "output.clouds?"]),
+        ("camera_init.window=1", ["camera_init.window: got 1", "an integer at least 2"]),
+        ("tracking.max_drift_px=-1", ["got -1", "a number above 0, or null"]),
+        ("labels.band_weight=2", ["got 2", "at least 0 and at most 1"]),
+        ("seed=true", ["seed: got true", "an integer"]),
+        ("seed='4'", ['seed: got "4"', "an integer"]),
+        ("seed=1.5", ["seed: got 1.5", "an integer"]),
+        ("output.clouds=1", ["output.clouds: got 1", "true or false"]),
+        ("energy=both", ['got "both"', "one of map, unsquared"]),
+        ("nonrigid.annealing=[1, x]", ["nonrigid.annealing", '"x" in the list', "a list of numbers"]),
+        ("nonrigid.depth_sigma=.nan", ["nonrigid.depth_sigma: got nan", "finite"]),
+        ("input.max_depth_m=.inf", ["input.max_depth_m: got inf", "finite"]),
+        ("seed=2024-01-01", ["seed: got"]),
+        ("fusion=4", ["fusion: got 4", "a section with the fields", "neighbours"]),
+        ("seed", ["--set seed", "section.field=VALUE"]),
+        ("=3", ["section.field=VALUE"]),
+        ("seed=[", ["--set seed", "not a YAML value"]),
+        ("output={clouds: true, clouds: false}", ["given twice"]),
+    ],
+)
+def test_a_wrong_override_says_where_what_and_what_is_allowed(override: str, parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [override])
+    for part in parts:
+        assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("nonrigd:\n  neighbours: 3\n", ["nonrigd: unknown field", "nonrigid?"]),
+        ("nonrigid:\n  neighbours: -3\n", ["nonrigid.neighbours: got -3"]),
+        ("- 1\n- 2\n", ["holds list", "mapping"]),
+        ("a: [1\n", ["not valid YAML", "line 2"]),
+        ("seed: 1\nseed: 2\n", ["line 2", "given twice"]),
+        ("seed: !!python/object/apply:os.system ['true']\n", ["not valid YAML"]),
+        ("preset: papr\n", ["papr: no such preset", "paper?"]),
+        ("preset: 3\n", ["preset: got 3"]),
+        ("1: 2\n", ["a field name must be a text"]),
+        ("seed: -1\nenergy: x\nnormalization: y\n", ["seed: got -1", "energy: got", "normalization: got"]),
+    ],
+)
+def test_a_wrong_file_is_named_with_the_mistake(text: str, parts: list[str], tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.yaml", text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    for part in parts:
+        assert part in str(caught.value)
+    assert str(path) in str(caught.value) or "preset" in str(caught.value)
+
+
+def test_the_message_says_which_layer_a_value_came_from(tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.yaml", "seed: -1\n")
+    with pytest.raises(ConfigError, match=r"mine\.yaml: seed: got -1"):
+        load_config(path, ["energy=map"])
+    with pytest.raises(ConfigError, match="--set: seed: got -2"):
+        load_config(path, ["seed=-2"])
+
+
+@pytest.mark.parametrize("name", ["nosuch", "papr", "nosuch.yaml", "folder/nosuch.yaml"])
+def test_what_is_neither_preset_nor_file_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"no such (preset or )?file"):
+        load_config(name)
+
+
+def test_a_folder_and_a_binary_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path / "binary.yaml")
+
+
+def test_scenes_take_overrides_and_report_contradictions() -> None:
+    scene = with_overrides(SyntheticSceneConfig(), ["num_frames=4", "noise.depth_flicker=0.0"])
+    assert (scene.num_frames, scene.noise.depth_flicker) == (4, 0.0)
+    with pytest.raises(ConfigError, match="margin_px 100 leaves nothing"):
+        with_overrides(SyntheticSceneConfig(), ["margin_px=100", "height=64"])
+
+
+def test_every_field_says_what_it_means_and_takes() -> None:
+    for field in describe_fields(Config()):
+        assert field.description, field.path
+        assert field.allowed, field.path
+        assert "class" not in field.allowed, field.path
+        assert find_field(Config, tuple(field.path.split("."))) is not None
+    assert "nonrigid.solver.max_iterations" in set(field_paths(Config))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text(max_size=30), st.text(max_size=30))
+def test_any_text_as_override_is_taken_or_refused_with_a_message(name: str, value: str) -> None:
+    for override in (f"{name}={value}", f"seed={value}", f"nonrigid={value}", f"energy={value}"):
+        with contextlib.suppress(ConfigError):
+            assert isinstance(load_config(None, [override]), Config)
