@@ -11,7 +11,8 @@ from uni4d_fg.config.solver import KernelConfig, SolverConfig
 class CameraMotionConfig(Section):
     """E_cam: relative change of successive relative motions."""
 
-    weight: float = setting(1.0, "Weight of each of E_rot and E_trans; 0 switches the term off.", ge=0)
+    rotation_weight: float = setting(1.0, "Weight of E_rot; 0 switches it off.", ge=0)
+    translation_weight: float = setting(1.0, "Weight of E_trans; 0 switches it off.", ge=0)
     rotation_floor_rad: float = setting(
         2e-3,
         "Guard added to the denominator of E_rot, rad: a camera at rest has zero, not infinite, energy.",
@@ -36,7 +37,7 @@ class CameraInitConfig(Section):
     )
     reprojection_sigma_px: float = setting(1.0, "Standard deviation of a depth reprojection residual, px.", gt=0)
     kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of depth reprojection.")
-    camera_motion: CameraMotionConfig = setting(CameraMotionConfig(weight=0.0), "E_cam within the window.")
+    camera_motion: CameraMotionConfig = setting(CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0), "E_cam within the window.")
     solver: SolverConfig = setting(SolverConfig(max_iterations=15, relative_decrease=1e-3), "Solver of each window.")
 
 
@@ -66,7 +67,7 @@ class BundleAdjustmentConfig(Section):
         True, "Use the depth prior with a log-scale per frame; without it one distance anchors the scale."
     )
     depth_scale_prior_sigma: float = setting(0.05, "Standard deviation of a frame's log-scale about zero.", gt=0)
-    camera_motion: CameraMotionConfig = setting(CameraMotionConfig(weight=0.1), "E_cam.")
+    camera_motion: CameraMotionConfig = setting(CameraMotionConfig(rotation_weight=1.0, translation_weight=100.0), "E_cam.")
     max_reprojection_px: float = setting(8.0, "Observations above this after the first solve are dropped, px.", gt=0)
     min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2)
     max_depth_ratio: float = setting(

@@ -16,16 +16,25 @@ _NORM_SMOOTHING = 1e-2
 
 def camera_motion_terms(frames: IntArray, config: CameraMotionConfig, unsquared: bool) -> list[FactorBatch]:
     """Return E_rot and E_trans over consecutive ``frames`` (W,); empty when switched off or W < 3."""
-    if config.weight == 0.0 or len(frames) < 3:
+    if len(frames) < 3:
         return []
     slots = tuple(Slot("pose", frames[i : len(frames) - 2 + i]) for i in range(3))
     count = len(frames) - 2
     kernel = Kernel("norm", _NORM_SMOOTHING) if unsquared else Kernel("quadratic")
-    weight = config.weight / count if unsquared else config.weight
-    floors = ((CAMERA_ROTATION, config.rotation_floor_rad), (CAMERA_TRANSLATION, config.translation_floor_m))
+    terms = (
+        (CAMERA_ROTATION, config.rotation_weight, config.rotation_floor_rad),
+        (CAMERA_TRANSLATION, config.translation_weight, config.translation_floor_m),
+    )
     return [
-        FactorBatch.create(family, slots, {"floor": np.full(count, floor)}, weight=weight, kernel=kernel)
-        for family, floor in floors
+        FactorBatch.create(
+            family,
+            slots,
+            {"floor": np.full(count, floor)},
+            weight=weight / count if unsquared else weight,
+            kernel=kernel,
+        )
+        for family, weight, floor in terms
+        if weight > 0
     ]
 
 
