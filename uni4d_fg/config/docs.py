@@ -1,4 +1,7 @@
-"""The page ``docs/configuration.md``, generated from the models: ``python -m uni4d_fg.config.docs [--check]``."""
+"""The page ``docs/configuration.md``, generated from the models.
+
+``python -m uni4d_fg.config.docs`` in the source checkout writes it, ``--check`` tells whether it is up to date.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import Any
 
 from uni4d_fg.config.base import Section
 from uni4d_fg.config.describe import FieldDescription, describe_fields, section_type
-from uni4d_fg.config.load import load_config, preset_names, presets_folder
+from uni4d_fg.config.load import load_config, preset_names
 from uni4d_fg.config.models import Config
 from uni4d_fg.synthetic.config import SyntheticSceneConfig
 
@@ -59,12 +62,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Generate docs/configuration.md.")
     parser.add_argument("--check", action="store_true", help="only check that the page is up to date")
     options = parser.parse_args(arguments)
-    page = presets_folder().parent / PAGE
     text = configuration_page()
+    if not PAGE.parent.is_dir():
+        sys.exit(f"there is no folder {PAGE.parent} here: run this in the source checkout")
     if not options.check:
-        page.write_text(text, encoding="utf-8")
-    elif not page.exists() or page.read_text(encoding="utf-8") != text:
-        sys.exit(f"{page} is out of date: run python -m uni4d_fg.config.docs")
+        PAGE.write_text(text, encoding="utf-8")
+    elif not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
+        sys.exit(f"{PAGE} is out of date: run python -m uni4d_fg.config.docs")
 
 
 def _presets_table() -> str:
