@@ -10,7 +10,6 @@ from uni4d_fg.config import docs
 from uni4d_fg.config.describe import describe_fields
 from uni4d_fg.config.models import Config
 
-
 CHECKOUT = Path(__file__).resolve().parents[2]
 
 
