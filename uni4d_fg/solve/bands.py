@@ -60,7 +60,7 @@ class BandAssembler:
             track: (P,) track of every point; points of one track are consecutive.
         """
         self._point_sum = _summing(np.concatenate(rows), len(track))
-        # A factor that couples a track beyond the reach keeps its diagonal blocks only: leaving out some of
+        # A factor that couples a track beyond the reach keeps the blocks of single points only: leaving out some of
         # its other blocks could make the sum indefinite.
         complete = np.ones(len(rows[0]), dtype=bool)
         for p in rows:
@@ -116,7 +116,7 @@ def _plan_lag(lag: int, rows: list[IntArray], track: IntArray, complete: BoolArr
     pairs, points, start = [], [], 0
     for i, p in enumerate(rows):
         for j, q in enumerate(rows):
-            taken = np.asarray((track[p] == track[q]) & (p - q == lag) & (complete | (i == j)))
+            taken = np.asarray((track[p] == track[q]) & (p - q == lag) & (complete | (lag == 0)))
             count = int(taken.sum())
             if count == 0:
                 continue

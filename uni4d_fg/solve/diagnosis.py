@@ -88,6 +88,6 @@ def null_directions_message(
         share[name] = share.get(name, 0.0) + weight
     most = sorted(share, key=lambda name: -share[name])[:_LISTED]
     return (
-        f"Every variable is determined on its own, but {flat.shape[1]} joint directions are free, mostly of "
-        f"{'; '.join(most)}: anchor a pose or the scale."
+        f"Every variable is determined on its own, but not all together (free joint directions: {flat.shape[1]}, "
+        f"mostly of {'; '.join(most)}): anchor a pose or the scale."
     )

@@ -106,8 +106,10 @@ class GraphObjective:
                 blocks[key] += information[start:stop, start:stop]
                 touching[key].append(i)
                 start = stop
-        weak = [key for key, block in blocks.items() if len(block) and len(undetermined(block[None]))]
-        described = [f"{decode(key)} (factors: {touching[key] or 'none'})" for key in weak[:5]]
+        # A variable that no factor reads is not part of the system.
+        read = [key for key in blocks if touching[key]]
+        weak = [key for key in read if len(undetermined(blocks[key][None]))]
+        described = [f"{decode(key)} (factors: {', '.join(map(str, touching[key]))})" for key in weak[:5]]
         return listing(described, len(weak))
 
 

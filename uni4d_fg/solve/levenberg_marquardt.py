@@ -3,6 +3,9 @@
 Damping follows Nielsen (1999), "Damping parameter in Marquardt's method": an accepted step with gain ratio
 q scales the damping by max(1/3, 1 - (2q - 1)^3), a rejected one by a factor that doubles each time. A step
 is accepted only if it lowers the energy, so that the energy never rises.
+
+The damping diagonal has a floor, so that a variable which no factor determines stays where it is instead of
+making the system singular. What remains singular at every damping is reported with the variables' names.
 """
 
 from __future__ import annotations
