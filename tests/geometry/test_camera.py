@@ -74,7 +74,9 @@ def test_shapes_broadcast() -> None:
 def test_inverse_depth_is_exact_in_front_and_linear_behind() -> None:
     z = np.array([NEAR_PLANE, 0.5, 2.0])
     np.testing.assert_array_equal(inverse_depth(z), 1.0 / z)
-    np.testing.assert_allclose(inverse_depth(np.array([0.0, -1.0])), (2 * NEAR_PLANE - np.array([0, -1])) / NEAR_PLANE**2)
+    np.testing.assert_allclose(
+        inverse_depth(np.array([0.0, -1.0])), (2 * NEAR_PLANE - np.array([0, -1])) / NEAR_PLANE**2
+    )
     z = np.linspace(-1.0, 3.0, 401) + 1e-4
     step = 1e-7
     numerical = (inverse_depth(z + step) - inverse_depth(z - step)) / (2 * step)

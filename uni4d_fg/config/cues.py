@@ -20,8 +20,9 @@ class TrackingConfig(Section):
     convergence_px: float = setting(0.01, "Lucas-Kanade stops when a point moves less than this, px.", gt=0)
     forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0)
     max_drift_px: float | None = setting(
-        2.0,
-        "Largest distance between a point and where its first appearance is found, px; null: not checked.",
+        None,
+        "Largest distance between a point and where its first appearance is found, px; null: not checked. The check "
+        "removes drifted observations, and with them some that hold the cameras.",
         gt=0,
     )
     max_patch_error: float = setting(12.0, "Largest mean absolute grey-level difference of the window.", gt=0)

@@ -27,9 +27,7 @@ def open_images(path: Path) -> ImageFolder | VideoFrames:
     return ImageFolder(list_frames(path, IMAGE_SUFFIXES))
 
 
-def open_depth(
-    path: Path, size: tuple[int, int] | None, units_per_metre: float = 1000.0
-) -> DepthFolder | NpyDepth:
+def open_depth(path: Path, size: tuple[int, int] | None, units_per_metre: float = 1000.0) -> DepthFolder | NpyDepth:
     """Open a folder of depth maps or one ``.npy`` file of images of ``size``. Raises InputError."""
     if path.is_file():
         return NpyDepth(path, size)
@@ -44,9 +42,7 @@ def open_masks(path: Path, size: tuple[int, int] | None) -> MaskFolder:
 def check_count(path: Path, found: int, expected: int) -> None:
     """Raise InputError unless a cue has as many frames as there are images."""
     if found != expected:
-        raise SequenceProblem(
-            path, f"has {found} frames, but there are {expected} images", "give one per image"
-        )
+        raise SequenceProblem(path, f"has {found} frames, but there are {expected} images", "give one per image")
 
 
 def check_length(path: Path, num_frames: int) -> None:
@@ -79,9 +75,7 @@ def load_ground_truth(
     arrays = load_npz(path, {}, {"intrinsics": 1, "track_points": 3})
     intrinsics, points = arrays.get("intrinsics"), arrays.get("track_points")
     if intrinsics is not None:
-        valid = intrinsics.shape == (4,) and bool(
-            np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all()
-        )
+        valid = intrinsics.shape == (4,) and bool(np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all())
         if not valid:
             raise SequenceProblem(
                 path, "intrinsics are not fx, fy, cx, cy with positive focal lengths", "save them as (4,)"
@@ -89,11 +83,7 @@ def load_ground_truth(
         intrinsics = intrinsics.astype(np.float64)
     if points is not None:
         if num_tracks is None or points.shape != (num_tracks, num_frames, 3):
-            expected = (
-                "there are no tracks"
-                if num_tracks is None
-                else f"({num_tracks}, {num_frames}, 3) is expected"
-            )
+            expected = "there are no tracks" if num_tracks is None else f"({num_tracks}, {num_frames}, 3) is expected"
             raise SequenceProblem(
                 path,
                 f"track_points has shape {points.shape}, but {expected}",
@@ -145,21 +135,15 @@ def assemble(files: SequenceFiles) -> Sequence:
         depths=depths,
         masks=masks,
         intrinsics=(
-            guess_intrinsics(size)
-            if files.intrinsics is None
-            else load_intrinsics(files.intrinsics, num_frames, size)
+            guess_intrinsics(size) if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size)
         ),
         image_size=size,
         timestamps=(
-            default_timestamps(images)
-            if files.timestamps is None
-            else load_timestamps(files.timestamps, num_frames)
+            default_timestamps(images) if files.timestamps is None else load_timestamps(files.timestamps, num_frames)
         ),
         root=files.root,
         frame_names=frame_names(images),
-        initial_world_T_cam=None
-        if files.initial_poses is None
-        else load_poses(files.initial_poses, num_frames),
+        initial_world_T_cam=None if files.initial_poses is None else load_poses(files.initial_poses, num_frames),
         tracks=tracks,
         ground_truth=_assemble_truth(files, num_frames, size, None if tracks is None else tracks.num_tracks),
     )

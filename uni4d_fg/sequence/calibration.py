@@ -67,9 +67,7 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
         )
     below = matrices[:, (1, 2, 2, 2), (0, 0, 1, 2)] - np.array([0.0, 0.0, 0.0, 1.0])
     if np.abs(below).max() > 1e-6:
-        raise SequenceProblem(
-            path, "is not a pinhole matrix", "save [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-        )
+        raise SequenceProblem(path, "is not a pinhole matrix", "save [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
     skew = np.abs(matrices[:, 0, 1]).max()
     if skew > MAX_SKEW * focal.min():
         raise SequenceProblem(path, f"has a skew of {skew:g} px", "rectify the images; skew is not modelled")
@@ -93,9 +91,7 @@ def implausible(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
     if not (0 <= cx < width and 0 <= cy < height):
         return f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px"
     if abs(cx - (width - 1) / 2) > 0.25 * width or abs(cy - (height - 1) / 2) > 0.25 * height:
-        return (
-            f"principal point ({cx:.1f}, {cy:.1f}) is far from the centre of the {width} x {height} px image"
-        )
+        return f"principal point ({cx:.1f}, {cy:.1f}) is far from the centre of the {width} x {height} px image"
     if not 0.2 * width < fx < 10 * width:
         return f"focal length {fx:.1f} px is unusual for an image {width} px wide"
     if not 0.8 < fx / fy < 1.25:

@@ -133,9 +133,7 @@ def read_mask(path: Path) -> Int32Array:
     if path.suffix.lower() == ".npy":
         values = load_npy(path)
         if values.ndim != 2 or values.dtype.kind not in "biu":
-            raise SequenceProblem(
-                path, f"has shape {values.shape} of {values.dtype}", "save it as (H, W) integer ids"
-            )
+            raise SequenceProblem(path, f"has shape {values.shape} of {values.dtype}", "save it as (H, W) integer ids")
         if values.size and (int(values.min()) < 0 or int(values.max()) > np.iinfo(np.int32).max):
             raise SequenceProblem(
                 path, f"has ids from {values.min()} to {values.max()}", "use ids from 0 to 2147483647"

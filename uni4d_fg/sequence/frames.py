@@ -137,9 +137,7 @@ class NpyDepth(LazyFrames[Float32Array]):
         self.path = path
         values = load_npy(path, memory_map=True)
         if values.ndim not in (3, 4) or (values.ndim == 4 and values.shape[1] != 1):
-            raise SequenceProblem(
-                path, f"has shape {values.shape}", "save depth as (T, H, W) or (T, 1, H, W)"
-            )
+            raise SequenceProblem(path, f"has shape {values.shape}", "save depth as (T, H, W) or (T, 1, H, W)")
         if values.dtype.kind != "f":
             raise SequenceProblem(
                 path, f"holds {values.dtype} values of unknown unit", "save depth as floats in metres"

@@ -90,9 +90,7 @@ def list_frames(folder: Path, suffixes: Iterable[str]) -> tuple[Path, ...]:
     frames = tuple(folder / name for name in names if Path(name).suffix.lower() in accepted)
     if not frames:
         found = f"it holds {some_of(names, 3)}" if names else "it is empty"
-        raise SequenceProblem(
-            folder, f"has no {', '.join(accepted)} file ({found})", "put one file per frame there"
-        )
+        raise SequenceProblem(folder, f"has no {', '.join(accepted)} file ({found})", "put one file per frame there")
     return frames
 
 

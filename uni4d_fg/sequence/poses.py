@@ -81,9 +81,7 @@ def load_timestamps(path: Path, num_frames: int) -> FloatArray:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise SequenceProblem(
-            path, f"cannot be read ({error})", "write one number of seconds per line"
-        ) from error
+        raise SequenceProblem(path, f"cannot be read ({error})", "write one number of seconds per line") from error
     times: list[float] = []
     for number, line in enumerate(lines, start=1):
         text = line.strip()
@@ -96,9 +94,7 @@ def load_timestamps(path: Path, num_frames: int) -> FloatArray:
                 path, f"line {number}: {text[:40]!r} is not a number", "write one number of seconds per line"
             ) from error
     if len(times) != num_frames:
-        raise SequenceProblem(
-            path, f"has {len(times)} timestamps for {num_frames} frames", "write one line per frame"
-        )
+        raise SequenceProblem(path, f"has {len(times)} timestamps for {num_frames} frames", "write one line per frame")
     timestamps = np.array(times)
     if not np.isfinite(timestamps).all():
         raise SequenceProblem(path, "has a NaN or infinite timestamp", "write one number of seconds per line")

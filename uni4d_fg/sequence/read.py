@@ -32,9 +32,7 @@ def detect_layout(root: Path, depth: str | None = None) -> LayoutName:
         if depth is not None:
             # A named depth folder with a depth.npy inside is Uni4D's; one of images is native.
             return "uni4d" if (root / depth / "depth.npy").is_file() else "native"
-        raise SequenceProblem(
-            root, "holds both the native and Uni4D's layout", "choose layout native or uni4d"
-        )
+        raise SequenceProblem(root, "holds both the native and Uni4D's layout", "choose layout native or uni4d")
     if uni4d:
         return "uni4d"
     if native or find_images(root) is not None:

@@ -42,9 +42,7 @@ class Findings:
         except InputError as error:
             self.add_error(item, error, severity)
         except OSError as error:
-            self.add(
-                severity, item, f"cannot be read ({error})", "check that the files exist and are readable"
-            )
+            self.add(severity, item, f"cannot be read ({error})", "check that the files exist and are readable")
         except MemoryError:
             self.add(severity, item, "does not fit into memory", "use smaller images or fewer tracks")
         return None
@@ -97,8 +95,6 @@ def scan_frames(
             low, high = min(low, limits[0]), max(high, limits[1])
         visit(frame, array)
     if unlisted:
-        findings.add(
-            "error", item, f"{unlisted} more frames cannot be used either", "repair or remove them all"
-        )
+        findings.add("error", item, f"{unlisted} more frames cannot be used either", "repair or remove them all")
     limits = (low, high) if low <= high else None
     findings.items.append(ItemSummary(item, len(frames), shape, dtype, limits))

@@ -48,9 +48,7 @@ class RawTracks:
             if array is not None and array.shape != expected
         ]
         if self.uv.shape != (*shape, 2):
-            found.append(
-                SequenceProblem(self.path, f"uv has shape {self.uv.shape} but visible has {shape}", remedy)
-            )
+            found.append(SequenceProblem(self.path, f"uv has shape {self.uv.shape} but visible has {shape}", remedy))
         elif shape[1] != num_frames:
             found.append(
                 SequenceProblem(
@@ -82,9 +80,7 @@ class RawTracks:
             add(f"query_frame has values that are not frames 0 to {num_frames - 1}", "save frame indices")
         if self.confidence is not None:
             with np.errstate(invalid="ignore"):
-                outside = (self.confidence < -_CONFIDENCE_ROUNDING) | (
-                    self.confidence > 1 + _CONFIDENCE_ROUNDING
-                )
+                outside = (self.confidence < -_CONFIDENCE_ROUNDING) | (self.confidence > 1 + _CONFIDENCE_ROUNDING)
             if outside.any():
                 add("confidence has values outside [0, 1]", "scale it to [0, 1] or leave it out")
         if self.image_size is not None and self.image_size != size:

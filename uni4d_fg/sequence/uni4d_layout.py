@@ -64,15 +64,11 @@ def _choose(
     if candidates:
         names = ", ".join(folder.name for folder in candidates)
         problems.append(
-            SequenceProblem(
-                root, f"has more than one {cue} folder: {names}", f"choose the {cue} folder by name"
-            )
+            SequenceProblem(root, f"has more than one {cue} folder: {names}", f"choose the {cue} folder by name")
         )
     elif required:
         problems.append(
-            SequenceProblem(
-                root, f"has no {cue}: no folder holds {expected}", f"run the {cue} preprocessing first"
-            )
+            SequenceProblem(root, f"has no {cue}: no folder holds {expected}", f"run the {cue} preprocessing first")
         )
     return None
 
@@ -96,9 +92,7 @@ def find_uni4d_files(
     """
     check_root(root)
     if not depth_gt_scale > 0:
-        raise SequenceProblem(
-            root, f"depth_gt_scale {depth_gt_scale} is not positive", "give units per metre"
-        )
+        raise SequenceProblem(root, f"depth_gt_scale {depth_gt_scale} is not positive", "give units per metre")
     problems: list[SequenceProblem] = []
     images = find_images(root)
     if images is None:

@@ -133,9 +133,7 @@ class _Validation:
 
         scan_frames(item, frames, self.findings, visit)
         if missing and len(empty) == len(missing):
-            self.findings.add(
-                "error", item, f"{path}: all depth is missing", "check how the depth was exported"
-            )
+            self.findings.add("error", item, f"{path}: all depth is missing", "check how the depth was exported")
         elif empty:
             self.findings.add(
                 "warning",
@@ -224,9 +222,7 @@ class _Validation:
 
     def _tracks(self, path: Path | None, num_frames: int, size: tuple[int, int]) -> None:
         if path is None:
-            self.findings.add(
-                "info", "tracks", "there are no tracks", "none: the built-in tracker makes them"
-            )
+            self.findings.add("info", "tracks", "there are no tracks", "none: the built-in tracker makes them")
             return
         raw = self.findings.attempt("tracks", lambda: assemble.load_tracks(self.files, path))
         if raw is None:

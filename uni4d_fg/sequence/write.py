@@ -92,9 +92,7 @@ def write_uni4d(sequence: Sequence, root: Path) -> None:
         save_npy(folder / "unidepth" / "intrinsics.npy", intrinsics_matrix(sequence.intrinsics))
         _write_masks(sequence.masks, folder / "deva" / "Annotations", names, always_rgb=True)
         if sequence.tracks is not None:
-            _write_uni4d_tracks(
-                sequence.tracks, sequence.image_size, folder / "cotrackerv3_10_50" / "results.npz"
-            )
+            _write_uni4d_tracks(sequence.tracks, sequence.image_size, folder / "cotrackerv3_10_50" / "results.npz")
         if truth.depths is not None:
             for name, depth in zip(names, truth.depths, strict=True):
                 save_npy(folder / "depth_gt" / f"{name}.npy", clean_depth(depth))
@@ -125,9 +123,7 @@ def _write_images(sequence: Sequence, folder: Path, names: Iterable[str]) -> Non
         _write_png(folder / f"{name}.png", np.ascontiguousarray(image[:, :, ::-1]))
 
 
-def _write_masks(
-    masks: FrameSource[Int32Array], folder: Path, names: Iterable[str], always_rgb: bool
-) -> None:
+def _write_masks(masks: FrameSource[Int32Array], folder: Path, names: Iterable[str], always_rgb: bool) -> None:
     folder.mkdir(parents=True)
     for name, mask in zip(names, masks, strict=True):
         low, high = int(mask.min()), int(mask.max())
@@ -159,9 +155,7 @@ def _write_depth(depths: FrameSource[Float32Array], folder: Path, names: tuple[s
         _write_png(folder / f"{name}.png", millimetres.astype(np.uint16))
 
 
-def _write_depth_array(
-    depths: FrameSource[Float32Array], path: Path, shape: tuple[int, ...], missing: float
-) -> None:
+def _write_depth_array(depths: FrameSource[Float32Array], path: Path, shape: tuple[int, ...], missing: float) -> None:
     """Write frame after frame behind a .npy header; through a memory map a full disk would kill the process."""
     with open(path, "wb") as stream:
         np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
@@ -188,9 +182,7 @@ def _hold_position(tracks: Tracks) -> FloatArray:
     following = np.where(tracks.visible, frame, num_frames)[:, ::-1]
     following = np.minimum.accumulate(following, axis=1)[:, ::-1]
     source = np.where(last >= 0, last, following)
-    held = np.take_along_axis(tracks.uv, np.minimum(source, num_frames - 1)[..., None], axis=1).astype(
-        np.float64
-    )
+    held = np.take_along_axis(tracks.uv, np.minimum(source, num_frames - 1)[..., None], axis=1).astype(np.float64)
     held[source == num_frames] = 0.0
     return held
 
