@@ -52,9 +52,7 @@ def static_energy(
     """
     tracks, _ = observations.rows()
     state = State({"pose": world_T_cam, "intrinsics": intrinsics[None], "landmark": landmarks}, VariableNames(tracks))
-    config = BundleAdjustmentConfig(
-        depth_prior=False, camera_motion=CameraMotionConfig(), reprojection_kernel=_NORM
-    )
+    config = BundleAdjustmentConfig(depth_prior=False, camera_motion=CameraMotionConfig(), reprojection_kernel=_NORM)
     stage = bundle_adjustment_stage(
         state, observations, _UNIT_NOISE, config, intrinsics[None], Freedom(poses=False, intrinsics=False),
         unsquared=True, normalization=normalization,

@@ -49,7 +49,7 @@ class MissingDependencyError(Uni4dFgError):
     exit_code = 7
 
 
-class Cancelled(Uni4dFgError):  # noqa: N818 - an event, not a fault
+class Cancelled(Uni4dFgError):
     """The user interrupted the run; finished stages are on disk and ``--resume`` continues."""
 
     exit_code = 130

@@ -37,7 +37,9 @@ class CameraInitConfig(Section):
     )
     reprojection_sigma_px: float = setting(1.0, "Standard deviation of a depth reprojection residual, px.", gt=0)
     kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of depth reprojection.")
-    camera_motion: CameraMotionConfig = setting(CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0), "E_cam within the window.")
+    camera_motion: CameraMotionConfig = setting(
+        CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0), "E_cam within the window."
+    )
     solver: SolverConfig = setting(SolverConfig(max_iterations=15, relative_decrease=1e-3), "Solver of each window.")
 
 
@@ -67,7 +69,9 @@ class BundleAdjustmentConfig(Section):
         True, "Use the depth prior with a log-scale per frame; without it one distance anchors the scale."
     )
     depth_scale_prior_sigma: float = setting(0.05, "Standard deviation of a frame's log-scale about zero.", gt=0)
-    camera_motion: CameraMotionConfig = setting(CameraMotionConfig(rotation_weight=1.0, translation_weight=600.0), "E_cam.")
+    camera_motion: CameraMotionConfig = setting(
+        CameraMotionConfig(rotation_weight=1.0, translation_weight=600.0), "E_cam."
+    )
     max_reprojection_px: float = setting(8.0, "Observations above this after the first solve are dropped, px.", gt=0)
     min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2)
     max_depth_ratio: float = setting(
