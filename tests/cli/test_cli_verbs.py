@@ -158,6 +158,20 @@ def test_track_writes_a_file_and_does_not_replace_one(cli: Run, scene: Path, tmp
     assert cli("track", scene)[0] == 6  # the sequence has tracks of its own
 
 
+def test_track_needs_images_only(cli: Run, scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "rgb").symlink_to(scene / "rgb")
+    words = ["--quiet", "--set", "tracking.grid_columns=6", "--set", "tracking.grid_rows=4"]
+    assert cli("track", tmp_path, *words)[0] == 0
+    assert (tmp_path / "tracks.npz").is_file()
+    (tmp_path / "deva" / "Annotations").mkdir(parents=True)
+    code, _, err = cli("track", tmp_path, *words)
+    assert code == 3
+    assert "--out" in err
+    code, _, err = cli("track", tmp_path / "deva")
+    assert code == 3
+    assert "rgb" in err
+
+
 def test_reconstruct_leaves_a_run_folder(finished: Path, scene: Path) -> None:
     for name in ("reconstruction.npz", "trajectory.tum", "depth.npy", "summary.json", "labels.npz", "config.yaml"):
         assert (finished / name).is_file(), name
@@ -178,6 +192,8 @@ def test_a_run_is_not_overwritten_by_accident(cli: Run, finished: Path, scene: P
         assert code == 6
         assert "holds no run" in err
     assert (tmp_path / "thesis.txt").read_text() == "mine"
+    (tmp_path / "input.json").write_text('{"root": "/"}')
+    assert cli("reconstruct", scene, "--out", tmp_path, "--overwrite")[0] == 6
     assert cli("reconstruct", scene, "--out", tmp_path / "thesis.txt")[0] == 6
 
 

@@ -218,7 +218,7 @@ def test_every_field_says_what_it_means_and_takes() -> None:
     assert "nonrigid.solver.max_iterations" in set(field_paths(Config))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.text(max_size=30), st.text(max_size=30))
 def test_any_text_as_override_is_taken_or_refused_with_a_message(name: str, value: str) -> None:
     for override in (f"{name}={value}", f"seed={value}", f"nonrigid={value}", f"energy={value}"):

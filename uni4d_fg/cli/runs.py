@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +54,14 @@ class SequenceInput:
 
 def is_run(folder: Path) -> bool:
     """Tell whether a folder holds a run, finished or not."""
-    if (folder / STORED_INPUT).is_file():
-        return True
     run = RunFolder(folder)
-    return run.config.is_file() and (run.summary.is_file() or (folder / "stages").is_dir())
+    if run.config.is_file() and (run.summary.is_file() or (folder / "stages").is_dir()):
+        return True
+    try:
+        stored = _read_json(folder / STORED_INPUT)
+    except InputError:
+        return False
+    return set(stored) == {field.name for field in fields(SequenceInput)}
 
 
 def prepare_run_folder(folder: Path, *, resume: bool, overwrite: bool) -> None:

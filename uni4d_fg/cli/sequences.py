@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,10 @@ from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import SequenceInput
 from uni4d_fg.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from uni4d_fg.arrays import ImageArray
+    from uni4d_fg.sequence.model import FrameSource
 
 
 def validate(
@@ -46,29 +50,46 @@ def track(
     out: Annotated[Path | None, typer.Option(help="Track file; SEQ/tracks.npz if not given.")] = None,
     config: options.ConfigChoice = None,
     changes: options.Overrides = None,
-    layout: options.Layout = LayoutChoice.auto,
-    depth: options.Depth = None,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Track points through a video with the built-in tracker and write them to a file."""
     from uni4d_fg.config.load import load_config
-    from uni4d_fg.sequence.read import read_sequence
     from uni4d_fg.tracks.io import save_tracks
     from uni4d_fg.tracks.lucas_kanade import track_grid
 
-    path = out or seq / "tracks.npz"
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already; replace it with --overwrite or choose another --out")
     settings = load_config(config, changes or ()).tracking
-    sequence = read_sequence(seq, layout.value, depth=depth)
+    images, path = images_and_track_file(seq, out, overwrite)
     with progress_reporter(quiet) as reporter, Interruption() as stop:
-        reporter.begin("tracking", 2 * (sequence.num_frames - 1))
-        found = track_grid(sequence.images, settings, lambda done, _: reporter.advance(done), stop)
+        reporter.begin("tracking", 2 * (len(images) - 1))
+        found = track_grid(images, settings, lambda done, _: reporter.advance(done), stop)
         reporter.end()
     save_tracks(path, found)
     length = found.visible.sum() / max(found.num_tracks, 1)
     typer.echo(f"{found.num_tracks} tracks, seen in {length:.1f} of {found.num_frames} frames on average: {path}")
+
+
+def images_and_track_file(seq: Path, out: Path | None, overwrite: bool) -> tuple[FrameSource[ImageArray], Path]:
+    """Open the images of a sequence, whatever its other files, and choose where its tracks go.
+
+    Raises:
+        InputError: If there are no images, or the layout has no place for the tracks and ``out`` is not given.
+        OutputError: If the file exists and is not to be replaced.
+    """
+    from uni4d_fg.sequence.assemble import open_images
+    from uni4d_fg.sequence.layout import check_root, find_images, missing_images
+    from uni4d_fg.sequence.uni4d_layout import is_uni4d_layout
+
+    check_root(seq)
+    found = find_images(seq)
+    if found is None:
+        raise missing_images(seq)
+    if out is None and is_uni4d_layout(seq):
+        raise InputError(f"{seq}: Uni4D's layout has no place for these tracks; choose a file with --out")
+    path = out or seq / "tracks.npz"
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; replace it with --overwrite or choose another --out")
+    return open_images(found), path
 
 
 def synthesize(
