@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from uni4d_fg.errors import Cancelled
 from uni4d_fg.evaluate.trajectory import Trajectory
 from uni4d_fg.evaluate.tum import write_tum
 from uni4d_fg.fusion.clouds import dynamic_cloud, dynamic_clouds, static_cloud
+from uni4d_fg.pipeline.leftovers import remove_views
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.reconstruction.clouds import write_clouds
 from uni4d_fg.reconstruction.depth_store import read_depth
@@ -21,6 +23,8 @@ from uni4d_fg.reconstruction.pictures import draw_depth_strip, draw_scene, draw_
 from uni4d_fg.reconstruction.run_folder import RunFolder
 from uni4d_fg.sequence.model import Sequence
 from uni4d_fg.tracks.model import LabelledTracks
+
+ValueT = TypeVar("ValueT")
 
 
 def assemble(sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> Reconstruction:
@@ -78,13 +82,14 @@ def write_views(
     config: Config,
     should_stop: Callable[[], bool],
 ) -> None:
-    """Write clouds and pictures, as the config asks.
+    """Write clouds and pictures, as the config asks, instead of those of an earlier result.
 
     Raises:
         Cancelled: If ``should_stop`` said so.
         OutputError: If a file cannot be written.
         MissingDependencyError: If clouds are asked for and Open3D cannot be loaded.
     """
+    remove_views(folder)
     if not (config.output.clouds or config.output.pictures):
         return
     depth = read_depth(folder.depth)
@@ -92,9 +97,8 @@ def write_views(
     static = static_cloud(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion)
     if config.output.clouds:
         moving = dynamic_clouds(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion)
-        write_clouds(folder, static, moving)
-    if should_stop():
-        raise Cancelled("stopped before the pictures; --resume continues")
+        write_clouds(folder, static, _until(should_stop, moving))
+    _check(should_stop)
     if config.output.pictures:
         draw_trajectory(folder.trajectory_picture, poses, sequence.ground_truth.world_T_cam)
         draw_depth_strip(folder.depth_picture, sequence.images, sequence.depths, depth)
@@ -105,3 +109,15 @@ def write_views(
             )
 
         draw_scene(folder.scene_picture, reconstruction, static, dynamic)
+
+
+def _until(should_stop: Callable[[], bool], items: Iterable[ValueT]) -> Iterator[ValueT]:
+    """Pass items on until the user interrupts."""
+    for item in items:
+        _check(should_stop)
+        yield item
+
+
+def _check(should_stop: Callable[[], bool]) -> None:
+    if should_stop():
+        raise Cancelled("stopped among the clouds and pictures; --resume continues")

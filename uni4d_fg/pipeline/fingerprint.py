@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.sequence.model import Sequence
 
 ALGORITHM_VERSION = 1
@@ -21,21 +21,27 @@ def sequence_key(sequence: Sequence, should_stop: Callable[[], bool] | None = No
 
     Raises:
         Cancelled: If ``should_stop`` said so.
-        InputError: If a frame cannot be read.
+        InputError: If a frame cannot be read or has another size than the sequence.
     """
     digest = hashlib.blake2b(digest_size=16)
     for frame in range(sequence.num_frames):
         if should_stop is not None and should_stop():
             raise Cancelled("stopped while reading the sequence")
-        for source in (sequence.images, sequence.depths, sequence.masks):
-            _update(digest, source[frame])
+        for name, source in (("image", sequence.images), ("depth", sequence.depths), ("mask", sequence.masks)):
+            array = source[frame]
+            if array.shape[:2] != sequence.image_size:
+                raise InputError(
+                    f"sequence {sequence.name}: {name} of frame {frame} is {array.shape[:2]}, but the images are "
+                    f"{sequence.image_size} (height, width); give every frame the same size"
+                )
+            _update(digest, array)
     _update(digest, sequence.intrinsics)
     _update(digest, sequence.timestamps)
     if sequence.initial_world_T_cam is not None:
         _update(digest, sequence.initial_world_T_cam)
     if sequence.tracks is not None:
-        for array in (sequence.tracks.uv, sequence.tracks.visible, sequence.tracks.query_frame):
-            _update(digest, array)
+        for values in (sequence.tracks.uv, sequence.tracks.visible, sequence.tracks.query_frame):
+            _update(digest, values)
     return digest.hexdigest()
 
 

@@ -6,21 +6,24 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
+from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
+from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
 from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.reconstruction.depth_store import read_depth
 from uni4d_fg.reconstruction.labels_io import load_labels, save_labels
 from uni4d_fg.reconstruction.run_folder import RunFolder
 from uni4d_fg.sequence.model import Sequence
@@ -28,6 +31,8 @@ from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.tracks.cache import load_or_track
 from uni4d_fg.tracks.labels import label_tracks
 from uni4d_fg.tracks.model import LabelledTracks
+
+ValueT = TypeVar("ValueT")
 
 
 @dataclass
@@ -106,12 +111,13 @@ def reconstruct(
         The summary that is also written as ``summary.json``.
 
     Raises:
-        InputError: If a cue cannot be read.
+        InputError: If a cue cannot be read, or the parts of the sequence contradict each other.
         DegenerateProblemError: If the cues do not determine the cameras.
         SolverError: If a stage cannot be solved.
         OutputError: If a result cannot be written.
         Cancelled: If ``should_stop`` turned true.
     """
+    check_sequence(sequence)
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
     summary = RunSummary(
@@ -126,6 +132,7 @@ def reconstruct(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
         reporter or SilentReporter(), should_stop or (lambda: False), summary,
     )  # fmt: skip
+    remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
     key = sequence_key(sequence, run.should_stop)
     key, labelled = _labels(run, key)
@@ -164,14 +171,15 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
         facts = [", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())]
         return StageRecord({"num_tracks": np.array(tracks.num_tracks)}, {"tracks": counts, "facts": facts})
 
-    if run.resume and not run.folder.labels.exists():
+    if run.resume and not _readable(lambda: load_labels(run.folder.labels)):
         run.store.discard("tracks")
     run.step("tracks", key, compute)
     return key, load_labels(run.folder.labels)
 
 
 def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> None:
-    if run.resume and not run.folder.depth.exists():
+    expected = (run.sequence.num_frames, *run.sequence.image_size)
+    if run.resume and not _readable(lambda: read_depth(run.folder.depth), lambda depth: depth.array.shape == expected):
         run.store.discard("fusion")
 
     def compute(hooks: Hooks) -> StageRecord:
@@ -181,3 +189,11 @@ def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: 
         return StageRecord({}, {})
 
     run.step("fusion", key, compute)
+
+
+def _readable(read: Callable[[], ValueT], fits: Callable[[ValueT], bool] = lambda _: True) -> bool:
+    """Tell whether a file that belongs to a stage's record is there, whole and of the right kind."""
+    try:
+        return fits(read())
+    except InputError:
+        return False

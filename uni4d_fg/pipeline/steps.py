@@ -62,8 +62,8 @@ def camera_init_step(sequence: Sequence, labelled: LabelledTracks, config: Confi
     }
     if result.bridged_frames:
         summary["warnings"] = [
-            f"{len(result.bridged_frames)} frames have too few static tracks and are posed by constant velocity: "
-            f"{_listed(result.bridged_frames)}"
+            f"{len(result.bridged_frames)} frame(s) share too few static tracks with those before and start from "
+            f"constant velocity: {_listed(result.bridged_frames)}"
         ]
     return StageRecord({"world_T_cam": result.world_T_cam, "intrinsics": result.intrinsics}, summary)
 
@@ -89,10 +89,10 @@ def bundle_adjustment_step(
             normalization=config.normalization,
             hooks=hooks,
         )
-    except DegenerateProblemError:
+    except DegenerateProblemError as reason:
         if not fixed:
             raise
-        return _without_landmarks(cameras, config)
+        return _without_landmarks(cameras, config, str(reason))
     _stop_if_cancelled(result.solves)
     return StageRecord(_bundle_arrays(result), _bundle_summary(sequence, result, config))
 
@@ -138,7 +138,7 @@ def _bundle_summary(sequence: Sequence, result: BundleAdjustmentResult, config: 
     }
 
 
-def _without_landmarks(cameras: Arrays, config: Config) -> StageRecord:
+def _without_landmarks(cameras: Arrays, config: Config, reason: str) -> StageRecord:
     num_frames = len(cameras["world_T_cam"])
     stage = config.bundle_adjustment
     arrays = {
@@ -150,7 +150,7 @@ def _without_landmarks(cameras: Arrays, config: Config) -> StageRecord:
         "landmark_error": np.zeros(0, dtype=np.float32),
         "noise": np.array([stage.reprojection_sigma_px, stage.depth_sigma]),
     }
-    warning = "no static track with depth: cameras kept as given, depth scales not estimated, noise not measured"
+    warning = f"cameras kept as given, depth scales not estimated, noise not measured ({reason})"
     return StageRecord(arrays, {"solves": [], "warnings": [warning]})
 
 
@@ -195,7 +195,7 @@ def _correct_cue(
     local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbours)
     fact = f"depth cue scaled per {'neighbourhood' if local.is_local else 'frame'}, noise {100 * local.sigma:.1f} %"
     observations = replace(observations, depth=observations.depth * np.exp(local.log_scale))
-    noise = replace(cameras.noise, depth_sigma=local.sigma)
+    noise = replace(cameras.noise, depth_sigma=max(local.sigma, config.bundle_adjustment.min_depth_sigma))
     return observations, replace(cameras, log_scale=np.zeros_like(cameras.log_scale), noise=noise), [fact]
 
 
