@@ -217,7 +217,7 @@ def adjust_bundle(
         hooks: Progress and cancellation.
 
     Raises:
-        DegenerateProblemError: If no static track can be lifted.
+        DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
         SolverError: If the system is singular or a cue is not finite.
     """
     num_frames = len(world_T_cam)
@@ -243,12 +243,13 @@ def adjust_bundle(
         if summary.termination is Termination.CANCELLED:
             break
         state, observations = _drop_outliers(state, observations, config, dropped)
-        noise = _measure(state, observations, noise, config)
         if len(observations) == 0:
+            counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)
             raise DegenerateProblemError(
-                f"bundle adjustment: every observation was dropped as an outlier in round {index + 1} "
-                f"(limit {config.max_reprojection_px} px); are the intrinsics or the masks wrong?"
+                f"bundle adjustment: every observation was dropped in round {index + 1} ({counts}); "
+                "check intrinsics and masks, or raise max_reprojection_px and max_depth_ratio"
             )
+        noise = _measure(state, observations, noise, config)
     if config.structure == "refine" and not unsquared and solves[-1].termination is not Termination.CANCELLED:
         for _ in range(2):  # the second solve uses the depth noise that the first one reveals
             state, summary = run_stage(structure_stage(state, observations, noise, config), state, hooks)
@@ -264,6 +265,11 @@ def adjust_bundle(
     assert track is not None
     keep = _spatial_inliers(landmarks, config)
     dropped["landmark far from its neighbours"] = int((~keep).sum())
+    if not keep.any():
+        raise DegenerateProblemError(
+            f"bundle adjustment: all {len(keep)} landmarks are dropped as far from their neighbours; "
+            "raise outlier_factor or outlier_quantile"
+        )
     error = _landmark_error(state.replace(landmark=landmarks), observations)[keep]
     observations = observations.select(np.isin(observations.track, track[keep]))
     return BundleAdjustmentResult(

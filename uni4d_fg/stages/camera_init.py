@@ -52,6 +52,13 @@ class PairSource:
         self.max_tracks = max_tracks
         self._tracks: dict[tuple[int, int], IntArray] = {}
 
+    def shared(self, frames: list[int], newest: int) -> int:
+        """Return the number of residuals that link ``newest`` to ``frames`` before thinning, both ways."""
+        return sum(
+            int((self.liftable[:, i] & self.seen[:, newest]).sum() + (self.liftable[:, newest] & self.seen[:, i]).sum())
+            for i in frames
+        )
+
     def tracks(self, source: int, target: int) -> IntArray:
         """Return the tracks liftable in ``source`` and seen in ``target``, thinned evenly."""
         if (source, target) not in self._tracks:
@@ -149,8 +156,7 @@ def initialize_cameras(
         poses = state["pose"].copy()
         poses[newest] = _predict(poses, newest)
         state = state.replace(pose=poses)
-        shared = sum(len(pairs.tracks(i, newest)) + len(pairs.tracks(newest, i)) for i in frames[:-1].tolist())
-        if shared < 2 * config.min_tracks_per_frame:
+        if pairs.shared(frames[:-1].tolist(), newest) < 2 * config.min_tracks_per_frame:
             bridged.append(newest)
             continue
         stage = window_stage(
@@ -168,10 +174,11 @@ def initialize_cameras(
         if summary.termination is Termination.CANCELLED:
             break
     if num_frames > 1 and not summaries:
+        counts = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in labelled.counts().items())
         raise DegenerateProblemError(
-            "camera initialisation: no two frames share "
-            f"{config.min_tracks_per_frame} static tracks with depth. Check masks (is everything marked as moving?), "
-            "depth (is it zero or missing?) and tracks; 'uni4d-fg validate' lists what was found."
+            f"camera initialisation: no two frames share {config.min_tracks_per_frame} static tracks with depth "
+            f"({counts}; {int(pairs.liftable.sum())} static observations have depth). Check masks (is everything "
+            "marked as moving?), depth (is it zero or missing?) and tracks; 'uni4d-fg validate' lists what was found."
         )
     return CameraInitResult(state["pose"], state["intrinsics"][0], summaries, tuple(bridged))
 

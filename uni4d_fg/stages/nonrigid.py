@@ -300,8 +300,8 @@ def solve_nonrigid(
 def _energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
     """Return which trajectories move plausibly.
 
-    A trajectory's energy is its largest |step| relative to the median step of its instance and frame, so
-    that a fast object is not punished for its speed; those above the quantile plus margin are dropped.
+    A trajectory's energy is its largest |difference| (of the order of the smoothness term) over the term's
+    sigma; those above the quantile of all trajectories plus the margin are dropped.
     """
     step = np.linalg.norm(np.diff(points, n=config.smoothness_order, axis=1), axis=2)
     if step.shape[1] == 0:
