@@ -57,20 +57,20 @@ class BundleAdjustmentConfig(Section):
     )
     reprojection_sigma_factor: float = setting(1.0, "Measured reprojection sigma is multiplied by this.", gt=0)
     depth_sigma_factor: float = setting(
-        15.0,
+        16.0,
         "The depth prior of the camera solves is this much wider: a cue errs alike in neighbouring pixels and frames.",
         gt=0,
     )
     min_reprojection_sigma_px: float = setting(0.1, "Floor of the measured reprojection sigma, px.", gt=0)
     min_depth_sigma: float = setting(0.002, "Floor of the measured depth sigma.", gt=0)
-    reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.0), "Kernel of E_BA.")
+    reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=0.7), "Kernel of E_BA.")
     depth_kernel: KernelConfig = setting(KernelConfig(kind="cauchy", threshold=2.0), "Kernel of the depth prior.")
     depth_prior: bool = setting(
         True, "Use the depth prior with a log-scale per frame; without it one distance anchors the scale."
     )
     depth_scale_prior_sigma: float = setting(0.05, "Standard deviation of a frame's log-scale about zero.", gt=0)
     camera_motion: CameraMotionConfig = setting(
-        CameraMotionConfig(rotation_weight=1.0, translation_weight=600.0), "E_cam."
+        CameraMotionConfig(rotation_weight=1.0, translation_weight=500.0), "E_cam."
     )
     max_reprojection_px: float = setting(8.0, "Observations above this after the first solve are dropped, px.", gt=0)
     min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2)
@@ -87,7 +87,7 @@ class BundleAdjustmentConfig(Section):
     )
     outlier_factor: float = setting(3.0, "Factor on that quantile.", gt=0)
     drift_frames: float = setting(
-        60.0, "A track's observation this many frames from its query frame has twice the variance (tracks drift).", gt=0
+        30.0, "A track's observation this many frames from its query frame has twice the variance (tracks drift).", gt=0
     )
     structure: Literal["refine", "relift", "keep"] = setting(
         "refine",
@@ -95,7 +95,7 @@ class BundleAdjustmentConfig(Section):
         "the depth prior at its measured sigma; 'relift': mean lift of the depth cue (the reference's choice); "
         "'keep': as they are.",
     )
-    solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=3e-4), "Solver.")
+    solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.")
 
 
 class NonRigidConfig(Section):

@@ -242,6 +242,8 @@ def adjust_bundle(
         solves.append(summary)
         if summary.termination is Termination.CANCELLED:
             break
+        if config.depth_prior and freedom.poses:
+            state = _hold_metric_scale(state)
         state, observations = _drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
             counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)
@@ -276,6 +278,21 @@ def adjust_bundle(
         state["pose"], state["intrinsics"][0], state["log_scale"][:, 0], landmarks[keep], track[keep],
         observations, noise, error, solves, dropped,
     )  # fmt: skip
+
+
+def _hold_metric_scale(state: State) -> State:
+    """Scale the world about frame 0's centre so that the frames' log-scales have zero mean.
+
+    Reprojection does not see the scale of the world, and the widened depth prior holds it weakly: the cue's
+    mean over all frames is the best metric scale there is.
+    """
+    shift = float(np.mean(state["log_scale"]))
+    factor = np.exp(-shift)
+    poses = state["pose"].copy()
+    centre = poses[0, :3, 3].copy()
+    poses[:, :3, 3] = centre + factor * (poses[:, :3, 3] - centre)
+    landmarks = centre + factor * (state["landmark"] - centre)
+    return state.replace(pose=poses, landmark=landmarks, log_scale=state["log_scale"] - shift)
 
 
 def _landmark_error(state: State, observations: Observations) -> Float32Array:
