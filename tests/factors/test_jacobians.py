@@ -12,7 +12,7 @@ from uni4d_fg.factors.depth_prior import DYNAMIC_DEPTH_PRIOR, STATIC_DEPTH_PRIOR
 from uni4d_fg.factors.depth_reprojection import DEPTH_REPROJECTION
 from uni4d_fg.factors.dynamic_reprojection import DYNAMIC_REPROJECTION
 from uni4d_fg.factors.family import FactorFamily
-from uni4d_fg.factors.priors import INTRINSICS_PRIOR, LOG_SCALE_PRIOR, SCALE_ANCHOR
+from uni4d_fg.factors.priors import ASPECT_PRIOR, INTRINSICS_PRIOR, LOG_SCALE_PRIOR, SCALE_ANCHOR
 from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
 from uni4d_fg.factors.temporal_smoothness import ACCELERATION_SMOOTHNESS, VELOCITY_SMOOTHNESS
 from uni4d_fg.geometry import se3
@@ -32,6 +32,7 @@ FAMILIES = [
     ACCELERATION_SMOOTHNESS,
     CAMERA_ROTATION,
     CAMERA_TRANSLATION,
+    ASPECT_PRIOR,
     INTRINSICS_PRIOR,
     LOG_SCALE_PRIOR,
     SCALE_ANCHOR,
@@ -64,6 +65,8 @@ def random_data(name: str, rng: np.random.Generator, family: FactorFamily) -> np
         return rng.normal(scale=0.1, size=N)
     if name == "floor":
         return np.full(N, 1e-3)
+    if name == "measured" and family is ASPECT_PRIOR:
+        return rng.normal(scale=0.1, size=N)
     if name == "measured":
         return random_variable(family.variables[0], rng)
     return rng.uniform(1.0, 4.0, size=N)

@@ -14,7 +14,7 @@ from uni4d_fg.tracks.cache import cache_key, load_or_track
 from uni4d_fg.tracks.io import load_tracks, save_tracks
 from uni4d_fg.tracks.model import Tracks
 
-CONFIG = TrackingConfig(grid_columns=6, grid_rows=5, query_interval=2)
+CONFIG = TrackingConfig(grid_columns=6, grid_rows=5, query_interval=2, max_drift_px=2.0)
 
 
 @pytest.fixture

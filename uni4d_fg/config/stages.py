@@ -35,6 +35,9 @@ class CameraInitConfig(Section):
     focal_prior_fraction: float = setting(
         0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0
     )
+    aspect_prior_sigma: float = setting(
+        1e-3, "Standard deviation of log(fx / fy) about the given intrinsics' own: pixels keep their shape.", gt=0
+    )
     reprojection_sigma_px: float = setting(1.0, "Standard deviation of a depth reprojection residual, px.", gt=0)
     kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of depth reprojection.")
     camera_motion: CameraMotionConfig = setting(
@@ -49,6 +52,9 @@ class BundleAdjustmentConfig(Section):
     free_principal_point: bool = setting(False, "Free cx, cy too (if input.intrinsics is free).")
     focal_prior_fraction: float = setting(
         0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0
+    )
+    aspect_prior_sigma: float = setting(
+        1e-3, "Standard deviation of log(fx / fy) about the given intrinsics' own: pixels keep their shape.", gt=0
     )
     reprojection_sigma_px: float = setting(1.0, "Starting standard deviation of static reprojection, px.", gt=0)
     depth_sigma: float = setting(0.03, "Starting standard deviation of log depth.", gt=0)

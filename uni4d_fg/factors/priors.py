@@ -48,6 +48,29 @@ def scale_linearize(
     return (0.5 * np.log(squared) - np.log(distance))[:, None], jacobians
 
 
+def aspect_residual(intrinsics: Array, *, measured: Array) -> Array:
+    """Return (N, 1) of intrinsics (N, 4) and the measured log(fx / fy) (N,)."""
+    xp = namespace(intrinsics)
+    return (xp.log(intrinsics[..., 0]) - xp.log(intrinsics[..., 1]) - measured)[..., None]
+
+
+def aspect_linearize(intrinsics: FloatArray, *, measured: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the residual and its Jacobian (N, 1, 4)."""
+    jacobian = np.zeros((len(intrinsics), 1, 4))
+    jacobian[:, 0, 0] = 1.0 / intrinsics[:, 0]
+    jacobian[:, 0, 1] = -1.0 / intrinsics[:, 1]
+    return aspect_residual(intrinsics, measured=measured), [jacobian]
+
+
+ASPECT_PRIOR = FactorFamily(
+    name="aspect_prior",
+    variables=("intrinsics",),
+    data=("measured",),
+    residual_dim=1,
+    residual=aspect_residual,
+    linearize=aspect_linearize,
+)
+
 INTRINSICS_PRIOR = FactorFamily(
     name="intrinsics_prior",
     variables=("intrinsics",),

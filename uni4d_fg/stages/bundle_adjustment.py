@@ -27,7 +27,7 @@ from uni4d_fg.stages.lifting import lift, mean_per_row
 from uni4d_fg.stages.noise import robust_sigma
 from uni4d_fg.stages.observations import Normalization, Observations, reprojection_weights
 from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
-from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_prior
+from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_priors
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def bundle_adjustment_stage(
         centre = config.free_principal_point
         free["intrinsics"] = np.array([[True, True, centre, centre]])
         if not unsquared:
-            batches.append(intrinsics_prior(prior_intrinsics, config.focal_prior_fraction))
+            batches += intrinsics_priors(prior_intrinsics, config.focal_prior_fraction, config.aspect_prior_sigma)
     if config.depth_prior:
         free["log_scale"] = np.ones((num_frames, 1), dtype=bool)
         sigma = noise.depth_sigma * config.depth_sigma_factor

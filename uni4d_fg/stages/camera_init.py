@@ -22,7 +22,7 @@ from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.observations import Normalization
 from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
-from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_prior
+from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_priors
 from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
 
 
@@ -125,7 +125,7 @@ def window_stage(
     if free_intrinsics:
         free["intrinsics"] = np.array([[True, True, False, False]])
         if not unsquared:
-            batches.append(intrinsics_prior(state["intrinsics"], config.focal_prior_fraction))
+            batches += intrinsics_priors(state["intrinsics"], config.focal_prior_fraction, config.aspect_prior_sigma)
     return Stage(f"camera_init[{frames[0]}-{frames[-1]}]", tuple(batches), free, config.solver)
 
 

@@ -9,7 +9,7 @@ from uni4d_fg.config.stages import CameraMotionConfig
 from uni4d_fg.factors.batch import FactorBatch, Slot
 from uni4d_fg.factors.camera_motion import CAMERA_ROTATION, CAMERA_TRANSLATION
 from uni4d_fg.factors.kernels import Kernel
-from uni4d_fg.factors.priors import INTRINSICS_PRIOR
+from uni4d_fg.factors.priors import ASPECT_PRIOR, INTRINSICS_PRIOR
 
 _NORM_SMOOTHING = 1e-2
 
@@ -38,10 +38,19 @@ def camera_motion_terms(frames: IntArray, config: CameraMotionConfig, unsquared:
     ]
 
 
-def intrinsics_prior(intrinsics: FloatArray, fraction: float) -> FactorBatch:
-    """Return a prior on the intrinsics (1, 4) whose sigma is a part of the focal lengths."""
+def intrinsics_priors(intrinsics: FloatArray, focal_fraction: float, aspect_sigma: float) -> list[FactorBatch]:
+    """Return the priors on the intrinsics (1, 4): about their value, and on the shape of a pixel.
+
+    Args:
+        intrinsics: (1, 4) the sequence's own.
+        focal_fraction: Sigma of every entry as a part of the focal lengths.
+        aspect_sigma: Sigma of log(fx / fy).
+    """
     fx, fy = intrinsics[0, 0], intrinsics[0, 1]
-    sigma = fraction * np.array([[fx, fy, fx, fy]])
-    return FactorBatch.create(
-        INTRINSICS_PRIOR, (Slot("intrinsics", np.zeros(1, dtype=np.int64)),), {"measured": intrinsics}, sigma=sigma
-    )
+    slots = (Slot("intrinsics", np.zeros(1, dtype=np.int64)),)
+    sigma = focal_fraction * np.array([[fx, fy, fx, fy]])
+    ratio = np.log(intrinsics[:, 0] / intrinsics[:, 1])
+    return [
+        FactorBatch.create(INTRINSICS_PRIOR, slots, {"measured": intrinsics}, sigma=sigma),
+        FactorBatch.create(ASPECT_PRIOR, slots, {"measured": ratio}, sigma=aspect_sigma),
+    ]
