@@ -50,7 +50,7 @@ def densify_frame(
     """Correct one frame's depth cue.
 
     Args:
-        depth: (H, W) cue, m, NaN where missing.
+        depth: (H, W) cue, m, NaN where missing; zero, negative and infinite values count as missing.
         mask: (H, W) 0 static, > 0 instance.
         intrinsics: (4,) px.
         control: Control points of this frame.
@@ -59,9 +59,11 @@ def densify_frame(
         config: Fusion.
 
     Returns:
-        (H, W) float32 m, NaN exactly where the cue is.
+        (H, W) float32 m, NaN exactly where the cue is missing.
     """
     height, width = depth.shape
+    with np.errstate(invalid="ignore"):
+        depth = np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))
     out = depth * np.float32(np.exp(frame_log_scale))
     nodes = _grid(depth, intrinsics, config.stride)
     limit = config.max_scale_sigmas * depth_sigma

@@ -27,11 +27,14 @@ from uni4d_fg.stages.bundle_adjustment import (
 )
 from uni4d_fg.stages.camera_init import initialize_cameras
 from uni4d_fg.stages.local_scale import predict_log_scale
-from uni4d_fg.stages.nonrigid import FrozenCameras, solve_nonrigid
+from uni4d_fg.stages.nonrigid import FrozenCameras, NonRigidResult, solve_nonrigid
 from uni4d_fg.stages.observations import Observations, observations_of, weigh_by_drift
 from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
 
 Arrays = Mapping[str, npt.NDArray[Any]]
+
+_MAX_DEPARTURE = 0.15
+"""A median |log z - log cue| of moving points above this is warned of."""
 
 
 def camera_init_step(sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks) -> StageRecord:
@@ -176,8 +179,25 @@ def nonrigid_step(labelled: LabelledTracks, scene: Arrays, config: Config, hooks
         "instance": result.instance,
     }
     facts.append(f"{len(result.track)} trajectories of {len(np.unique(result.instance))} instances")
-    summary = {"solves": [solve_dict(s) for s in solves], "dropped": result.dropped, "facts": facts}
+    summary: dict[str, Any] = {"solves": [solve_dict(s) for s in solves], "dropped": result.dropped, "facts": facts}
+    departure = _departure_from_cue(result, observations, cameras)
+    if departure > _MAX_DEPARTURE:
+        summary["warnings"] = [
+            f"the distances of moving points depart from the depth cue by {100 * departure:.0f} % (median): the energy "
+            "does not hold them; nonrigid.depth_prior does"
+        ]
     return StageRecord(arrays, summary)
+
+
+def _departure_from_cue(result: NonRigidResult, observations: Observations, cameras: FrozenCameras) -> float:
+    """Return the median of |log z - log cue| over the observations of the trajectories; 0 without any."""
+    used = observations.select(np.isin(observations.track, result.track) & np.isfinite(observations.depth))
+    if len(used) == 0:
+        return 0.0
+    points = result.points[np.searchsorted(result.track, used.track), used.frame]
+    z = world_to_camera(cameras.world_T_cam[used.frame], points)[:, 2]
+    ratio = np.log(np.maximum(z, NEAR_PLANE)) - np.log(used.depth) - cameras.log_scale[used.frame]
+    return float(np.median(np.abs(ratio)))
 
 
 def _correct_cue(
