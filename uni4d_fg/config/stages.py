@@ -63,7 +63,7 @@ class BundleAdjustmentConfig(Section):
     )
     reprojection_sigma_factor: float = setting(1.0, "Measured reprojection sigma is multiplied by this.", gt=0)
     depth_sigma_factor: float = setting(
-        16.0,
+        18.0,
         "The depth prior of the camera solves is this much wider: a cue errs alike in neighbouring pixels and frames.",
         gt=0,
     )
@@ -127,9 +127,11 @@ class NonRigidConfig(Section):
     reprojection: bool = setting(True, "Use E_NR.")
     depth_prior: bool = setting(True, "Use the depth prior.")
     reprojection_sigma_px: float | None = setting(
-        None, "Sigma of E_NR, px; null takes the one measured on the static scene."
+        None, "Sigma of E_NR, px; null takes the one measured on the static scene.", gt=0
     )
-    depth_sigma: float | None = setting(None, "Sigma of log depth; null takes the one measured on the static scene.")
+    depth_sigma: float | None = setting(
+        None, "Sigma of log depth; null takes the one measured on the static scene.", gt=0
+    )
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of E_NR.")
     depth_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of the depth prior.")
     smoothness_order: Literal[1, 2] = setting(2, "1: first difference (velocity); 2: second difference (acceleration).")
