@@ -175,7 +175,7 @@ def test_depth_missing_on_all_moving_objects(tmp_path: Path, scene: Sequence) ->
     depth[masks > 0] = np.nan
     summary, result = run_sound(with_depth(scene, depth), tmp_path)
     assert len(result.dynamic_points) == 0
-    assert summary.stages["nonrigid"]["dropped"]["dynamic track without depth"] > 20
+    assert summary.stages["nonrigid"]["dropped"]["dynamic track with too little depth"] > 20
     assert len(result.landmarks) > 150
 
 

@@ -114,6 +114,9 @@ class NonRigidConfig(Section):
         gt=0,
     )
     min_observations: int = setting(3, "Dynamic tracks seen in fewer frames are dropped.", ge=1)
+    min_depth_observations: int = setting(
+        2, "Dynamic tracks with a depth cue in fewer frames are dropped: one wrong depth would place them alone.", ge=1
+    )
     bridge_gaps: bool = setting(
         True,
         "Estimate a track's points in the frames between its first and last observation in which it is hidden.",

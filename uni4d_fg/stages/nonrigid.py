@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.stages import NonRigidConfig
@@ -221,9 +222,11 @@ def build_mesh(
     before = len(np.unique(observations.track))
     observations = observations.with_min_observations(min(config.min_observations, num_frames))
     lifted = lift(observations, cameras.world_T_cam, cameras.intrinsics, cameras.log_scale)
-    with_depth = np.isin(observations.track, observations.track[np.isfinite(lifted).all(axis=1)])
+    usable = np.isfinite(lifted).all(axis=1)
+    num_lifted = np.bincount(observations.track, usable, minlength=1)[observations.track]
+    with_depth = num_lifted >= min(config.min_depth_observations, num_frames)
     dropped["dynamic track with too few observations"] = before - len(np.unique(observations.track))
-    dropped["dynamic track without depth"] = len(np.unique(observations.track[~with_depth]))
+    dropped["dynamic track with too little depth"] = len(np.unique(observations.track[~with_depth]))
     observations, lifted = observations.select(with_depth), lifted[with_depth]
     tracks, trajectory = observations.rows()
     observed = np.zeros((len(tracks), num_frames), dtype=bool)
@@ -292,20 +295,54 @@ def solve_nonrigid(
     state, summary = run_stage(stage, state, hooks)
     points = np.full((*mesh.row.shape, 3), np.nan)
     points[mesh.row >= 0] = state["dynamic_point"]
-    keep = _energy_inliers(points, mesh, config)
-    dropped["dynamic track with a large motion energy"] = int((~keep).sum())
+    near, calm = _spatial_inliers(points, mesh, config), _energy_inliers(points, mesh, config)
+    keep = near & calm
+    dropped["dynamic track far from its instance"] = int((~near).sum())
+    dropped["dynamic track with a large motion energy"] = int((near & ~calm).sum())
     return NonRigidResult(points[keep], mesh.observed[keep], mesh.track[keep], mesh.instance[keep], summary, dropped)
 
 
 def _energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
     """Return which trajectories move plausibly.
 
-    A trajectory's energy is its largest |difference| (of the order of the smoothness term) over the term's
-    sigma; those above the quantile of all trajectories plus the margin are dropped.
+    A trajectory's score is the largest over its frames of its own smoothness residual plus the mean change
+    of the distances to its neighbours, both in sigmas; scores above the quantile plus margin are dropped.
     """
     step = np.linalg.norm(np.diff(points, n=config.smoothness_order, axis=1), axis=2)
     if step.shape[1] == 0:
         return np.ones(len(points), dtype=bool)
-    energy = np.nanmax(np.nan_to_num(step) / config.smoothness_sigma_m, axis=1)
-    result: BoolArray = energy <= np.quantile(energy, config.outlier_quantile) + config.outlier_margin
+    score = np.nan_to_num(step) / config.smoothness_sigma_m
+    first, second = mesh.pairs[:, 0], mesh.pairs[:, 1]
+    change = np.abs(np.diff(np.linalg.norm(points[first] - points[second], axis=2), axis=1)) / config.arap_sigma_m
+    known = np.isfinite(change)
+    total, count = np.zeros((2, len(points), change.shape[1]))
+    for end in (first, second):
+        np.add.at(total, end, np.where(known, change, 0.0))
+        np.add.at(count, end, known)
+    score = score + (total / np.maximum(count, 1.0))[:, : score.shape[1]]
+    worst = score.max(axis=1)
+    result: BoolArray = worst <= np.quantile(worst, config.outlier_quantile) + config.outlier_margin
     return result
+
+
+def _spatial_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
+    """Return which trajectories are near others of their instance.
+
+    A trajectory's score is the median over its observed frames of the distance to its nearest neighbour; one
+    above ``max_neighbour_ratio`` times the instance's median score floats in space (a wrong depth, mostly).
+    """
+    seen = mesh.observed & np.isfinite(points).all(axis=2)
+    nearest = np.full(seen.shape, np.nan)
+    for label in np.unique(mesh.instance).tolist():
+        members = mesh.instance == label
+        for frame in np.flatnonzero((seen & members[:, None]).sum(axis=0) > 1).tolist():
+            present = np.flatnonzero(members & seen[:, frame])
+            distance, _ = cKDTree(points[present, frame]).query(points[present, frame], k=2)
+            nearest[present, frame] = distance[:, 1]
+    keep = np.ones(len(points), dtype=bool)
+    rated = np.flatnonzero(np.isfinite(nearest).any(axis=1))
+    score = np.nanmedian(nearest[rated], axis=1)
+    for label in np.unique(mesh.instance[rated]).tolist():
+        mine = mesh.instance[rated] == label
+        keep[rated[mine]] = score[mine] <= config.max_neighbour_ratio * np.median(score[mine])
+    return keep
