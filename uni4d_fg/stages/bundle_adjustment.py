@@ -26,7 +26,7 @@ from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.lifting import lift, mean_per_row
 from uni4d_fg.stages.noise import robust_sigma
 from uni4d_fg.stages.observations import Normalization, Observations, reprojection_weights
-from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
+from uni4d_fg.stages.stage import Stage, StageRunner, kernel_of, run_stage
 from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_priors
 
 
@@ -202,6 +202,7 @@ def adjust_bundle(
     unsquared: bool,
     normalization: Normalization,
     hooks: Hooks | None = None,
+    run: StageRunner = run_stage,
 ) -> BundleAdjustmentResult:
     """Run stage 2 from the poses and intrinsics of stage 1.
 
@@ -215,6 +216,7 @@ def adjust_bundle(
         unsquared: The paper's energy instead of the MAP estimate.
         normalization: Weights of the paper's energy.
         hooks: Progress and cancellation.
+        run: What solves each declared stage.
 
     Raises:
         DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
@@ -238,7 +240,7 @@ def adjust_bundle(
             state, observations, noise, config, prior_intrinsics[None], freedom,
             unsquared=unsquared, normalization=normalization,
         )  # fmt: skip
-        state, summary = run_stage(stage, state, hooks)
+        state, summary = run(stage, state, hooks)
         solves.append(summary)
         if summary.termination is Termination.CANCELLED:
             break
@@ -254,7 +256,7 @@ def adjust_bundle(
         noise = _measure(state, observations, noise, config)
     if config.structure == "refine" and not unsquared and solves[-1].termination is not Termination.CANCELLED:
         for _ in range(2):  # the second solve uses the depth noise that the first one reveals
-            state, summary = run_stage(structure_stage(state, observations, noise, config), state, hooks)
+            state, summary = run(structure_stage(state, observations, noise, config), state, hooks)
             solves.append(summary)
             noise = _measure(state, observations, noise, config)
     landmarks = state["landmark"]

@@ -21,7 +21,7 @@ from uni4d_fg.graph.state import State
 from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.observations import Normalization
-from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
+from uni4d_fg.stages.stage import Stage, StageRunner, kernel_of, run_stage
 from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_priors
 from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
 
@@ -138,6 +138,7 @@ def initialize_cameras(
     unsquared: bool,
     normalization: Normalization,
     hooks: Hooks | None = None,
+    run: StageRunner = run_stage,
 ) -> CameraInitResult:
     """Estimate all poses (frame 0 is the world) and, if free, the focal lengths.
 
@@ -168,7 +169,7 @@ def initialize_cameras(
             unsquared=unsquared,
             normalization=normalization,
         )
-        state, summary = run_stage(stage, state, hooks)
+        state, summary = run(stage, state, hooks)
         summaries.append(summary)
         pairs.forget_before(int(frames[0]))
         if summary.termination is Termination.CANCELLED:

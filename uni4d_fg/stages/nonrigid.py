@@ -26,7 +26,7 @@ from uni4d_fg.stages.bundle_adjustment import StaticNoise
 from uni4d_fg.stages.lifting import lift
 from uni4d_fg.stages.neighbours import nearest_neighbours
 from uni4d_fg.stages.observations import Normalization, Observations, reprojection_weights
-from uni4d_fg.stages.stage import Stage, kernel_of, run_stage
+from uni4d_fg.stages.stage import Stage, StageRunner, kernel_of, run_stage
 
 
 @dataclass(frozen=True)
@@ -268,6 +268,7 @@ def solve_nonrigid(
     unsquared: bool,
     normalization: Normalization,
     hooks: Hooks | None = None,
+    run: StageRunner = run_stage,
 ) -> NonRigidResult:
     """Run stage 3; without dynamic tracks the result is empty.
 
@@ -279,6 +280,7 @@ def solve_nonrigid(
         unsquared: The paper's norms and weights instead of the MAP estimate.
         normalization: Weights of the paper's energy.
         hooks: Progress and cancellation.
+        run: What solves the declared stage.
 
     Raises:
         SolverError: If the system is singular or a cue is not finite.
@@ -292,7 +294,7 @@ def solve_nonrigid(
     stage = nonrigid_stage(
         state, mesh, observations, rows, cameras, config, unsquared=unsquared, normalization=normalization
     )
-    state, summary = run_stage(stage, state, hooks)
+    state, summary = run(stage, state, hooks)
     points = np.full((*mesh.row.shape, 3), np.nan)
     points[mesh.row >= 0] = state["dynamic_point"]
     near, calm = _spatial_inliers(points, mesh, config), _energy_inliers(points, mesh, config)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.solver import KernelConfig, SolverConfig
@@ -39,6 +39,16 @@ class Stage:
         """The least-squares problem of the last (unsmoothed) solve."""
         return Problem(self.batches, self.free)
 
+    @property
+    def reads_free_variables(self) -> bool:
+        """Whether any factor reads a variable that may move."""
+        problem = self.problem
+        return any(len(batch) and any(problem.is_free(s.group) for s in batch.slots) for batch in self.batches)
+
+
+StageRunner: TypeAlias = Callable[[Stage, State, Hooks | None], tuple[State, SolveSummary]]
+"""``run(stage, state, hooks)``: what solves a stage; :func:`run_stage`, or another minimiser of the same energy."""
+
 
 def run_stage(stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
     """Solve a stage from ``state``; the summary's energies are those of the final kernels.
@@ -48,7 +58,7 @@ def run_stage(stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[S
     """
     problem = stage.problem
     initial = problem.energies(state)
-    if not any(len(batch) and any(problem.is_free(s.group) for s in batch.slots) for batch in stage.batches):
+    if not stage.reads_free_variables:
         return state, SolveSummary(stage.name, Termination.NOTHING_TO_DO, initial, initial, (), {"total": 0.0})
     parts: list[SolveSummary] = []
     for factor in stage.annealing:
