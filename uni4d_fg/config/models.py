@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from uni4d_fg.config.adam import AdamConfig
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
@@ -29,6 +30,11 @@ class Config(Section):
         "'map': squared, robust terms with calibrated sigmas; 'unsquared': the paper's norms and weights, "
         "smoothed and annealed.",
     )
+    solver: Literal["lm", "adam"] = setting(
+        "lm",
+        "Minimiser of every stage: 'lm' is Levenberg-Marquardt; 'adam' is the first-order baseline, which needs "
+        "PyTorch and is made for the preset 'paper'.",
+    )
     seed: int = setting(0, "Seed of every random choice.", ge=0)
     input: InputConfig = setting(InputConfig(), "Use of what the sequence brings.")
     tracking: TrackingConfig = setting(TrackingConfig(), "Built-in tracker.")
@@ -36,5 +42,6 @@ class Config(Section):
     camera_init: CameraInitConfig = setting(CameraInitConfig(), "Stage 1.")
     bundle_adjustment: BundleAdjustmentConfig = setting(BundleAdjustmentConfig(), "Stage 2.")
     nonrigid: NonRigidConfig = setting(NonRigidConfig(), "Stage 3.")
+    adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
     fusion: FusionConfig = setting(FusionConfig(), "Fusion.")
     output: OutputConfig = setting(OutputConfig(), "Output.")

@@ -62,9 +62,13 @@ class BundleAdjustmentConfig(Section):
         True, "Replace both by the static scene's own (median absolute deviation) after a first solve."
     )
     reprojection_sigma_factor: float = setting(1.0, "Measured reprojection sigma is multiplied by this.", gt=0)
+    depth_correlation: float = setting(
+        0.5, "Starting correlation of the log-depth errors along a track; then measured.", ge=0, le=1
+    )
     depth_sigma_factor: float = setting(
-        18.0,
-        "The depth prior of the camera solves is this much wider: a cue errs alike in neighbouring pixels and frames.",
+        3.5,
+        "The depth prior of the camera solves is this much wider than its correlation along tracks says: a cue errs "
+        "alike in neighbouring pixels too.",
         gt=0,
     )
     min_reprojection_sigma_px: float = setting(0.1, "Floor of the measured reprojection sigma, px.", gt=0)

@@ -24,7 +24,7 @@ from uni4d_fg.graph.state import State, VariableNames
 from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.lifting import lift, mean_per_row
-from uni4d_fg.stages.noise import robust_sigma
+from uni4d_fg.stages.noise import intraclass_correlation, robust_sigma
 from uni4d_fg.stages.observations import Normalization, Observations, reprojection_weights
 from uni4d_fg.stages.stage import Stage, StageRunner, kernel_of, run_stage
 from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_priors
@@ -36,6 +36,15 @@ class StaticNoise:
 
     reprojection_sigma_px: float
     depth_sigma: float
+    depth_correlation: float = 0.0
+    """How alike the log-depth errors of one track are, in [0, 1]."""
+
+    def effective_depth_sigma(self, observations_per_track: float) -> float:
+        """Return the sigma at which n equally correlated depths of a track carry the information they have.
+
+        n values with correlation c carry as much as ``n / (1 + (n - 1) c)`` independent ones.
+        """
+        return self.depth_sigma * float(np.sqrt(1.0 + max(observations_per_track - 1.0, 0.0) * self.depth_correlation))
 
 
 @dataclass(frozen=True)
@@ -121,7 +130,8 @@ def bundle_adjustment_stage(
             batches += intrinsics_priors(prior_intrinsics, config.focal_prior_fraction, config.aspect_prior_sigma)
     if config.depth_prior:
         free["log_scale"] = np.ones((num_frames, 1), dtype=bool)
-        sigma = noise.depth_sigma * config.depth_sigma_factor
+        per_track = len(observations) / max(len(state["landmark"]), 1)
+        sigma = noise.effective_depth_sigma(per_track) * config.depth_sigma_factor
         batches += depth_prior_terms(observations, row, sigma, num_frames, config)
     elif freedom.poses:
         batches += scale_anchor(state["pose"])
@@ -232,7 +242,7 @@ def adjust_bundle(
             f"{config.min_observations} frames. Check masks and depth with 'uni4d-fg validate'."
         )
     state = _make_state(world_T_cam, intrinsics, zero_scale, landmarks, observations)
-    noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma)
+    noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma, config.depth_correlation)
     solves: list[SolveSummary] = []
     rounds = 1 if unsquared or not config.measure_noise else 2
     for index in range(rounds):
@@ -391,6 +401,7 @@ def _measure(
     return StaticNoise(
         max(pixel * config.reprojection_sigma_factor, config.min_reprojection_sigma_px),
         max(relative, config.min_depth_sigma) if np.isfinite(relative) else noise.depth_sigma,
+        intraclass_correlation(depth[:, 0], row[known]) if np.isfinite(relative) else noise.depth_correlation,
     )
 
 
