@@ -11,6 +11,25 @@ from uni4d_fg.errors import MissingDependencyError
 _APT_COMMAND = "apt-get install libusb-1.0-0 libgl1 libgomp1"
 
 
+def import_torch() -> Any:
+    """Import PyTorch when it is first needed.
+
+    Returns:
+        The ``torch`` module.
+
+    Raises:
+        MissingDependencyError: If the package is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("torch")
+    except ModuleNotFoundError as error:
+        missing = error.name or "torch"
+        command = "pip install 'uni4d-fg[adam]'" if missing == "torch" else f"pip install {missing}"
+        raise MissingDependencyError(f"the Adam solver needs {missing}, not installed: run `{command}`") from error
+    except (ImportError, OSError) as error:
+        raise MissingDependencyError(f"torch cannot be loaded ({error}): install it anew") from error
+
+
 def import_open3d() -> Any:
     """Import Open3D when it is first needed.
 

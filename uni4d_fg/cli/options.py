@@ -17,6 +17,13 @@ class LayoutChoice(str, Enum):
     uni4d = "uni4d"
 
 
+class SolverChoice(str, Enum):
+    """Minimisers of the stages."""
+
+    lm = "lm"
+    adam = "adam"
+
+
 SequenceFolder = Annotated[Path, typer.Argument(metavar="SEQ", help="Folder of the sequence.", show_default=False)]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)]
 Layout = Annotated[LayoutChoice, typer.Option(help="Layout of the sequence; 'auto' looks at what is there.")]
@@ -36,6 +43,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="FIELD=VALUE", help="Change one field; may be repeated.", show_default=False),
 ]
+Solver = Annotated[SolverChoice | None, typer.Option(help="Minimiser; short for --set solver=...", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a run; finished stages are kept.")]

@@ -26,6 +26,7 @@ def reconstruct(
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME if not given.")] = None,
     config: options.ConfigChoice = None,
     changes: options.Overrides = None,
+    solver: options.Solver = None,
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     layout: options.Layout = LayoutChoice.auto,
@@ -40,7 +41,8 @@ def reconstruct(
     """Reconstruct a sequence: cameras, static points, motion and depth, written to a run folder."""
     from uni4d_fg.config.load import load_config
 
-    settings = load_config(config, changes or ())
+    chosen = [] if solver is None else [f"solver={solver.value}"]
+    settings = load_config(config, [*(changes or ()), *chosen])
     source = SequenceInput.of(
         seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics
     )

@@ -19,6 +19,7 @@ from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.leftovers import remove_leftovers
+from uni4d_fg.pipeline.solver import solver_settings, stage_runner
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
@@ -115,9 +116,11 @@ def reconstruct(
         DegenerateProblemError: If the cues do not determine the cameras.
         SolverError: If a stage cannot be solved.
         OutputError: If a result cannot be written.
+        MissingDependencyError: If the solver needs a package that is not installed.
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    run_stage = stage_runner(config)
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
     summary = RunSummary(
@@ -136,14 +139,18 @@ def reconstruct(
     atomic_write_text(folder.config, dump_config(config))
     key = sequence_key(sequence, run.should_stop)
     key, labelled = _labels(run, key)
-    key = stage_key(key, config.camera_init, config.input, config.energy, config.normalization)
-    cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks))
+    key = stage_key(
+        key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
+    )
+    cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
     key = stage_key(key, config.bundle_adjustment)
     scene = run.step(
-        "bundle_adjustment", key, lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks)
+        "bundle_adjustment",
+        key,
+        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage),
     )
     key = stage_key(key, config.nonrigid)
-    motion = run.step("nonrigid", key, lambda hooks: nonrigid_step(labelled, scene, config, hooks))
+    motion = run.step("nonrigid", key, lambda hooks: nonrigid_step(labelled, scene, config, hooks, run_stage))
     key = stage_key(key, config.fusion)
     _fuse(run, key, labelled, scene, motion)
     reconstruction = assemble(sequence, labelled, scene, motion)

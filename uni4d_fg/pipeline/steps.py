@@ -29,6 +29,7 @@ from uni4d_fg.stages.camera_init import initialize_cameras
 from uni4d_fg.stages.local_scale import predict_log_scale
 from uni4d_fg.stages.nonrigid import FrozenCameras, NonRigidResult, solve_nonrigid
 from uni4d_fg.stages.observations import Observations, observations_of, weigh_by_drift
+from uni4d_fg.stages.stage import StageRunner, run_stage
 from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
 
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -37,7 +38,9 @@ _MAX_DEPARTURE = 0.15
 """A median |log z - log cue| of moving points above this is warned of."""
 
 
-def camera_init_step(sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks) -> StageRecord:
+def camera_init_step(
+    sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks, run: StageRunner = run_stage
+) -> StageRecord:
     """Stage 1, or the given poses when the config takes them."""
     if config.input.poses != "estimate":
         if sequence.initial_world_T_cam is None:
@@ -55,6 +58,7 @@ def camera_init_step(sequence: Sequence, labelled: LabelledTracks, config: Confi
         unsquared=config.energy == "unsquared",
         normalization=config.normalization,
         hooks=hooks,
+        run=run,
     )
     _stop_if_cancelled(result.windows)
     facts = [f"{len(result.windows)} windows, {sum(len(w.iterations) for w in result.windows)} iterations in all"]
@@ -72,7 +76,12 @@ def camera_init_step(sequence: Sequence, labelled: LabelledTracks, config: Confi
 
 
 def bundle_adjustment_step(
-    sequence: Sequence, labelled: LabelledTracks, cameras: Arrays, config: Config, hooks: Hooks
+    sequence: Sequence,
+    labelled: LabelledTracks,
+    cameras: Arrays,
+    config: Config,
+    hooks: Hooks,
+    run: StageRunner = run_stage,
 ) -> StageRecord:
     """Stage 2; with fixed poses and no static track the given cameras are kept as they are."""
     stage = config.bundle_adjustment
@@ -91,6 +100,7 @@ def bundle_adjustment_step(
             unsquared=config.energy == "unsquared",
             normalization=config.normalization,
             hooks=hooks,
+            run=run,
         )
     except DegenerateProblemError as reason:
         if not fixed:
@@ -157,7 +167,9 @@ def _without_landmarks(cameras: Arrays, config: Config, reason: str) -> StageRec
     return StageRecord(arrays, {"solves": [], "warnings": [warning]})
 
 
-def nonrigid_step(labelled: LabelledTracks, scene: Arrays, config: Config, hooks: Hooks) -> StageRecord:
+def nonrigid_step(
+    labelled: LabelledTracks, scene: Arrays, config: Config, hooks: Hooks, run: StageRunner = run_stage
+) -> StageRecord:
     """Stage 3; empty without dynamic tracks."""
     observations, cameras = observations_of(labelled, TrackLabel.DYNAMIC), frozen_cameras(scene)
     observations, cameras, facts = _correct_cue(observations, labelled, cameras, scene, config)
@@ -169,6 +181,7 @@ def nonrigid_step(labelled: LabelledTracks, scene: Arrays, config: Config, hooks
         unsquared=config.energy == "unsquared",
         normalization=config.normalization,
         hooks=hooks,
+        run=run,
     )
     solves = [] if result.solve is None else [result.solve]
     _stop_if_cancelled(solves)

@@ -17,14 +17,16 @@ class Termination(str, Enum):
     NOTHING_TO_DO = "nothing to optimise: no factor reads a free variable"
     MAX_ITERATIONS = "stopped: iteration limit"
     DAMPING_LIMIT = "stopped: no damping gives a lower energy"
+    EARLY_STOPPED = "stopped: no progress for the patience"
     CANCELLED = "stopped: cancelled"
 
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """One linearisation and the accepted step that followed it."""
+    """One linearisation and the accepted step that followed it; of a descent, one step."""
 
     energy: float
+    """After the step; of a descent the loss before it."""
     seconds: float
     """Time since the start of the solve."""
     damping: float
@@ -35,18 +37,18 @@ class IterationRecord:
 
 @dataclass(frozen=True)
 class SolveSummary:
-    """Outcome of one Levenberg-Marquardt solve."""
+    """Outcome of one solve."""
 
     name: str
     termination: Termination
     initial_energies: dict[str, float]
     """Energy per term at the start."""
     final_energies: dict[str, float]
-    """Energy per term at the end: never higher in total than at the start."""
+    """Energy per term at the end: Levenberg-Marquardt never ends higher in total than it starts."""
     iterations: tuple[IterationRecord, ...]
     """One record per accepted step."""
     seconds: dict[str, float]
-    """Wall time per phase: 'linearize', 'solve', 'evaluate', 'total'."""
+    """Wall time per phase ('linearize', 'solve' and 'evaluate', or 'prepare' and 'descend') and 'total'."""
     num_factors: int = 0
     num_variables: int = 0
     notes: dict[str, Any] = field(default_factory=dict)

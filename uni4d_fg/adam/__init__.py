@@ -1,0 +1,5 @@
+"""The baseline: the same stages and the same residual functions, minimised by Adam in PyTorch.
+
+This is how the authors of Uni4D optimise. PyTorch is an optional dependency (``pip install 'uni4d-fg[adam]'``),
+imported when a solve begins.
+"""

@@ -1,0 +1,157 @@
+"""A stage solved by Adam: takes the declarations of Levenberg-Marquardt and returns the same kind of result."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.adam.descent import Trace, descend
+from uni4d_fg.adam.energy import TorchEnergy
+from uni4d_fg.adam.parameters import Parameters
+from uni4d_fg.config.adam import AdamConfig, AdamScheduleConfig
+from uni4d_fg.errors import SolverError
+from uni4d_fg.factors.priors import SCALE_ANCHOR
+from uni4d_fg.graph.state import State
+from uni4d_fg.optional import import_torch
+from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.summary import IterationRecord, SolveSummary, Termination
+from uni4d_fg.stages.stage import Stage
+
+
+@dataclass(frozen=True)
+class AdamRunner:
+    """Solves stages by Adam; a ``StageRunner``.
+
+    Raises:
+        MissingDependencyError: On construction, if PyTorch is not installed.
+        SolverError: On construction, if the configuration asks for a GPU and there is none.
+    """
+
+    config: AdamConfig = field(default_factory=AdamConfig)
+    torch: Any = field(default_factory=import_torch, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.config.device == "cuda" and not self.torch.cuda.is_available():
+            raise SolverError("adam.device is 'cuda', but PyTorch finds no GPU: set it to 'cpu' or 'auto'")
+
+    @property
+    def device(self) -> str:
+        """Where the descent runs."""
+        if self.config.device == "auto":
+            return "cuda" if self.torch.cuda.is_available() else "cpu"
+        return self.config.device
+
+    def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
+        """Solve a stage from ``state``; energies in the summary are scored in double precision by NumPy.
+
+        A 'norm' kernel counts as the plain norm during the descent, and the stage's annealing is not used.
+
+        Raises:
+            SolverError: If the energy is not finite, at the start or later.
+        """
+        stage = self._adapted(stage)
+        initial = _finite_energies(stage, state)
+        if not stage.reads_free_variables:
+            return state, SolveSummary(stage.name, Termination.NOTHING_TO_DO, initial, initial, (), {"total": 0.0})
+        began = time.perf_counter()
+        torch, config = self.torch, self.config
+        dtype = getattr(torch, config.precision)
+        with self._deterministic():
+            parameters = Parameters.create(torch, state, stage.free, dtype, self.device)
+            energy = TorchEnergy(torch, stage.batches, state, parameters.moving, dtype, self.device)
+            prepared = time.perf_counter()
+            trace = descend(
+                torch, parameters.values, lambda: energy(parameters.groups()), schedule_of(stage.name, config),
+                amsgrad=config.amsgrad, keep_best=config.keep_best, name=stage.name, hooks=hooks,
+            )  # fmt: skip
+        solved = parameters.to_state(trace.best)
+        seconds = {"prepare": prepared - began, "descend": time.perf_counter() - prepared}
+        return solved, self._summary(stage, initial, solved, trace, seconds)
+
+    def _adapted(self, stage: Stage) -> Stage:
+        if not self.config.scale_anchor:
+            kept = tuple(batch for batch in stage.batches if batch.family is not SCALE_ANCHOR)
+            stage = replace(stage, batches=kept)
+        if self.config.reference_windows and stage_kind(stage.name) == "camera_init":
+            stage = floating_window(stage)
+        return stage
+
+    @contextmanager
+    def _deterministic(self) -> Iterator[None]:
+        """Make sums on a GPU reproducible for the time of a solve."""
+        torch = self.torch
+        if self.device == "cpu" or not self.config.deterministic:
+            yield
+            return
+        enabled = torch.are_deterministic_algorithms_enabled()
+        warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        try:
+            yield
+        finally:
+            torch.use_deterministic_algorithms(enabled, warn_only=warn_only)
+
+    def _summary(
+        self, stage: Stage, initial: dict[str, float], state: State, trace: Trace, seconds: dict[str, float]
+    ) -> SolveSummary:
+        records = (IterationRecord(loss, at, 0.0, 0, 0) for loss, at in zip(trace.losses, trace.seconds, strict=True))
+        notes = {
+            "solver": "adam",
+            "device": self.device,
+            "precision": self.config.precision,
+            "learning_rates": trace.learning_rates,
+        }
+        return SolveSummary(
+            stage.name,
+            trace.termination,
+            initial,
+            stage.problem.energies(state),
+            tuple(records),
+            {**seconds, "total": sum(seconds.values())},
+            num_factors=sum(len(batch) for batch in stage.batches),
+            num_variables=sum(int(rows.sum()) for rows in stage.problem.free_rows().values()),
+            notes=notes,
+        )
+
+
+def stage_kind(name: str) -> str:
+    """Return a stage's name without the frames of its window."""
+    return name.partition("[")[0]
+
+
+def schedule_of(name: str, config: AdamConfig) -> AdamScheduleConfig:
+    """Return the schedule of a stage; that of bundle adjustment for stages without their own."""
+    schedules = {"camera_init": config.camera_init, "nonrigid": config.nonrigid}
+    return schedules.get(stage_kind(name), config.bundle_adjustment)
+
+
+def floating_window(stage: Stage) -> Stage:
+    """Return a window of stage 1 in which every frame that a factor reads moves, but frame 0."""
+    free = stage.free["pose"].copy()
+    for batch in stage.batches:
+        for slot in batch.slots:
+            if slot.group == "pose":
+                free[slot.rows[slot.rows > 0]] = True
+    return replace(stage, free={**stage.free, "pose": free})
+
+
+def _finite_energies(stage: Stage, state: State) -> dict[str, float]:
+    """Return the energies at the start.
+
+    Raises:
+        SolverError: If one is not finite; names the factor.
+    """
+    energies = stage.problem.energies(state)
+    for batch in stage.batches:
+        if not math.isfinite(energies[batch.name]):
+            batch.check(*batch.family.linearize(*batch.gather(state), **batch.data), state)
+    bad = [name for name, value in energies.items() if not np.isfinite(value)]
+    if bad:
+        raise SolverError(f"{stage.name}: the starting energy of {', '.join(bad)} is not finite")
+    return energies
