@@ -259,7 +259,9 @@ def test_a_track_seen_in_one_frame_of_an_instance_is_kept_when_asked_for(tmp_pat
     moving = np.ptp(truth.track_points, axis=1).max(axis=1) > 0.01
     first = np.arange(FRAMES) == tracks.query_frame[:, None]
     sequence = seen_only(scene, first | ~moving[:, None])
-    _, result = run_sound(sequence, tmp_path, make_config("nonrigid.min_observations=1"))
+    _, result = run_sound(
+        sequence, tmp_path, make_config("nonrigid.min_observations=1", "nonrigid.min_depth_observations=1")
+    )
     assert (result.dynamic_observed.sum(axis=1) == 1).any()
     np.testing.assert_array_equal(np.isfinite(result.dynamic_points).all(axis=2), result.dynamic_observed)
 

@@ -15,7 +15,7 @@ def test_correlation_of_groups_is_recovered_despite_outliers(correlation: float,
     shared = rng.normal(size=800)[group] * np.sqrt(correlation)
     residuals = 0.02 * (shared + rng.normal(size=len(group)) * np.sqrt(1.0 - correlation))
     residuals[rng.random(len(group)) < 0.01] += 5.0
-    assert intraclass_correlation(residuals, group) == pytest.approx(correlation, abs=0.05)
+    assert intraclass_correlation(residuals, group) == pytest.approx(correlation, abs=0.1)
 
 
 @pytest.mark.parametrize("residuals", [np.zeros(0), np.zeros(5), np.ones(1)], ids=["none", "zero", "one"])
