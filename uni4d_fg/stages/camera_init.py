@@ -3,6 +3,7 @@
 Frames enter one by one. Each window holds the newest ``window`` frames; its poses (and, if free, the focal
 lengths) are solved against the depth reprojection of every ordered pair of its frames. Once the window has
 slid, its oldest frame is held fixed, so that it stays attached to everything before it; frame 0 always is.
+Where tracks break off within the window, the oldest frame of every part that hangs together is held.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.stages import CameraInitConfig
@@ -24,6 +26,9 @@ from uni4d_fg.stages.observations import Normalization
 from uni4d_fg.stages.stage import Stage, StageRunner, kernel_of, run_stage
 from uni4d_fg.stages.terms import camera_motion_terms, intrinsics_priors
 from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
+
+_TRACKS_OF_A_POSE = 3
+"""Depth reprojections that determine the pose of one frame relative to another."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,17 @@ class PairSource:
                 common = common[np.linspace(0, len(common) - 1, self.max_tracks).astype(np.int64)]
             self._tracks[source, target] = common
         return self._tracks[source, target]
+
+    def held(self, frames: IntArray) -> IntArray:
+        """Return the oldest frame of every part of a window (W,) that tracks hold together, ascending."""
+        enough = min(_TRACKS_OF_A_POSE, 2 * self.max_tracks or _TRACKS_OF_A_POSE)
+        linked = np.zeros((len(frames), len(frames)), dtype=bool)
+        for a, b in zip(*np.triu_indices(len(frames), 1), strict=True):
+            i, j = int(frames[a]), int(frames[b])
+            linked[a, b] = len(self.tracks(i, j)) + len(self.tracks(j, i)) >= enough
+        _, part = connected_components(linked, directed=False)
+        result: IntArray = frames[np.unique(part, return_index=True)[1]]
+        return np.sort(result)
 
     def forget_before(self, frame: int) -> None:
         """Drop cached pairs whose frames have left the window."""
@@ -120,7 +136,8 @@ def window_stage(
     batches = [pairs.batch(ordered, config, unsquared, normalization)]
     batches += camera_motion_terms(frames, config.camera_motion, unsquared)
     free_pose = np.zeros((len(state["pose"]), 6), dtype=bool)
-    free_pose[frames[1:]] = True
+    free_pose[frames] = True
+    free_pose[pairs.held(frames)] = False
     free = {"pose": free_pose}
     if free_intrinsics:
         free["intrinsics"] = np.array([[True, True, False, False]])
