@@ -55,7 +55,7 @@ class AdamRunner:
         Raises:
             SolverError: If the energy is not finite, at the start or later.
         """
-        stage = self._adapted(stage)
+        stage, state = self._adapted(stage, state)
         initial = _finite_energies(stage, state)
         if not stage.reads_free_variables:
             return state, SolveSummary(stage.name, Termination.NOTHING_TO_DO, initial, initial, (), {"total": 0.0})
@@ -74,13 +74,13 @@ class AdamRunner:
         seconds = {"prepare": prepared - began, "descend": time.perf_counter() - prepared}
         return solved, self._summary(stage, initial, solved, trace, seconds)
 
-    def _adapted(self, stage: Stage) -> Stage:
+    def _adapted(self, stage: Stage, state: State) -> tuple[Stage, State]:
         if not self.config.scale_anchor:
             kept = tuple(batch for batch in stage.batches if batch.family is not SCALE_ANCHOR)
             stage = replace(stage, batches=kept)
         if self.config.reference_windows and stage_kind(stage.name) == "camera_init":
-            stage = floating_window(stage)
-        return stage
+            return reference_window(stage, state)
+        return stage, state
 
     @contextmanager
     def _deterministic(self) -> Iterator[None]:
@@ -131,14 +131,17 @@ def schedule_of(name: str, config: AdamConfig) -> AdamScheduleConfig:
     return schedules.get(stage_kind(name), config.bundle_adjustment)
 
 
-def floating_window(stage: Stage) -> Stage:
-    """Return a window of stage 1 in which every frame that a factor reads moves, but frame 0."""
-    free = stage.free["pose"].copy()
-    for batch in stage.batches:
-        for slot in batch.slots:
-            if slot.group == "pose":
-                free[slot.rows[slot.rows > 0]] = True
-    return replace(stage, free={**stage.free, "pose": free})
+def reference_window(stage: Stage, state: State) -> tuple[Stage, State]:
+    """Return a window of stage 1 as in the reference program.
+
+    Every frame of the window moves but frame 0, and the newest starts at the pose of the frame before it.
+    """
+    rows = np.unique(np.concatenate([s.rows for b in stage.batches for s in b.slots if s.group == "pose"]))
+    free, poses = stage.free["pose"].copy(), state["pose"].copy()
+    free[rows[rows > 0]] = True
+    newest = int(rows[-1])
+    poses[newest] = poses[max(newest - 1, 0)]
+    return replace(stage, free={**stage.free, "pose": free}), state.replace(pose=poses)
 
 
 def _finite_energies(stage: Stage, state: State) -> dict[str, float]:

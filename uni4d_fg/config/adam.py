@@ -39,8 +39,9 @@ class AdamConfig(Section):
     amsgrad: bool = setting(True, "Use the variant of Adam whose second moment never falls.")
     reference_windows: bool = setting(
         True,
-        "Every frame of a stage 1 window moves but frame 0, as in the reference program, whose windows are not tied "
-        "to the frames before them; false holds the oldest, as the other solver does.",
+        "Windows of stage 1 as in the reference program: a new frame starts at the pose before it, and every frame "
+        "moves but frame 0, so that a window is not tied to the frames before it. False takes the windows of the "
+        "other solver: a start at constant velocity, the oldest frame held.",
     )
     keep_best: bool = setting(
         False, "End at the variables of the lowest loss; false ends at the last ones (the reference program)."
