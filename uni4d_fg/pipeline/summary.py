@@ -66,7 +66,7 @@ def peak_memory_mb() -> float:
 def versions() -> dict[str, str]:
     """Return the versions a result depends on."""
     out = {"python": platform.python_version()}
-    for package in ("uni4d-fg", "gtsam", "numpy", "scipy", "opencv-python-headless", "open3d"):
+    for package in ("uni4d-fg", "gtsam", "numpy", "scipy", "opencv-python-headless", "open3d", "torch"):
         try:
             out[package] = version(package)
         except PackageNotFoundError:
