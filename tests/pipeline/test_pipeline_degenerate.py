@@ -270,7 +270,7 @@ def test_a_track_seen_in_one_frame_of_an_instance_is_kept_when_asked_for(tmp_pat
 def test_coinciding_tracks(tmp_path: Path, scene: Sequence, preset: str) -> None:
     tracks = scene.tracks
     assert tracks is not None
-    some = np.arange(0, tracks.num_tracks, 3)
+    some = np.arange(0, tracks.num_tracks, 5)
     twice = tracks.select(np.concatenate([some, some]))
     _, result = run_sound(dataclasses.replace(scene, tracks=twice), tmp_path, make_config(preset=preset))
     half = len(some)

@@ -66,35 +66,29 @@ def assert_only_whole_files(run_dir: Path, sequence: Sequence) -> None:
         assert len(read_ply(path)[0]) == count
 
 
-def test_every_writer_fails_cleanly_and_the_run_can_be_resumed(
+def test_every_writer_fails_cleanly_and_the_run_goes_on_where_it_was(
     tmp_path: Path, sequence: Sequence, complete: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sync, failed = os.fsync, []
-    for failing in range(1, 40):
-        writes = 0
+    move, failed = os.replace, []
+    num_files = sum(path.is_file() for path in complete.rglob("*"))
 
-        def full(descriptor: int) -> None:
-            nonlocal writes
-            writes += 1
-            if writes == failing:  # noqa: B023 - used within this turn of the loop only
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            sync(descriptor)
+    def full_for_every_new_file(source: Path, target: Path) -> None:
+        if target.name not in failed:
+            failed.append(target.name)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        move(source, target)
 
-        run_dir = tmp_path / str(failing)
-        monkeypatch.setattr(os, "fsync", full)
-        try:
-            reconstruct(sequence, run_dir, WITH_CLOUDS)
-        except OutputError as error:
-            monkeypatch.setattr(os, "fsync", sync)
-            message = str(error)
-            assert message.endswith("No space left on device; free space or choose another --out")
-            failed.append(Path(message.removeprefix("cannot write ").split(":")[0]).name)
-            assert_only_whole_files(run_dir, sequence)
-        else:
-            break
-        if failing % 4 == 0:
-            run_sound(sequence, run_dir, WITH_CLOUDS, resume=True)
-            assert_same_result(run_dir, complete)
+    monkeypatch.setattr(os, "replace", full_for_every_new_file)
+    for attempt in range(1, num_files + 1):
+        with pytest.raises(OutputError) as caught:
+            reconstruct(sequence, tmp_path, WITH_CLOUDS, resume=True)
+        assert len(failed) == attempt
+        assert f"{failed[-1]}: No space left on device; free space or choose another --out" in str(caught.value)
+        assert_only_whole_files(tmp_path, sequence)
+        assert not list(tmp_path.rglob(failed[-1]))
+    reconstruct(sequence, tmp_path, WITH_CLOUDS, resume=True)
+    check_run(tmp_path, sequence)
+    assert_same_result(tmp_path, complete)
     stages = [f"{name}.npz" for name in ("tracks", "camera_init", "bundle_adjustment", "nonrigid")]
     views = ["static.ply", *(f"{t:05d}.ply" for t in range(4))]
     assert failed == [

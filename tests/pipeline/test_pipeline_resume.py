@@ -180,7 +180,9 @@ def test_files_of_others_are_left_alone(finished: Path, sequence: Sequence) -> N
     for folder in folders:
         folder.mkdir(parents=True)
     ours = [finished / ".tmp-0123abcd-labels.npz", finished / "stages" / ".tmp-89abcdef-nonrigid.npz"]
+    ours += [finished / "clouds" / "dynamic" / ".tmp-89abcdef-00001.ply", finished / "pictures" / ".tmp-0a0a0a0a-a.png"]
     for path in ours:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("left by a killed run")
     reconstruct(sequence, finished, quick(), resume=True)
     assert all(path.exists() for path in theirs + folders)
@@ -193,7 +195,7 @@ def test_cancelling_anywhere_and_resuming_ends_the_same(
     total = count_polls(sequence, tmp_path / "count")
     assert total > 20
     chosen = {1, 2, sequence.num_frames + 1, sequence.num_frames + 2, total}
-    chosen |= set(rng.choice(total, 8, replace=False).tolist()) - {0}
+    chosen |= set(rng.choice(total, 5, replace=False).tolist()) - {0}
     for poll in sorted(chosen):
         run_dir = tmp_path / f"poll-{poll}"
         with pytest.raises(Cancelled, match="stopped"):
@@ -236,13 +238,17 @@ def kill_runs(sequence: Sequence, config: Config, folder: Path, cases: list[str]
     return {name: int(number) for name, number in (line.split() for line in done.stdout.splitlines())}
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL") or sys.platform == "win32", reason="needs fork and SIGKILL")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs fork and SIGKILL")
 def test_a_killed_run_resumes_to_the_same_result(
     tmp_path: Path, sequence: Sequence, undisturbed: Path, rng: np.random.Generator
 ) -> None:
-    polls = rng.choice(np.arange(2, 20), 3, replace=False).tolist()
-    seconds = rng.uniform(0.0, 0.4, 4).round(3).tolist()
-    cases = [f"write:{n}" for n in range(1, 12)] + [f"poll:{n}" for n in polls] + [f"seconds:{s}" for s in seconds]
+    polls = rng.choice(np.arange(2, 20), 2, replace=False).tolist()
+    seconds = rng.uniform(0.0, 0.4, 3).round(3).tolist()
+    cases = (
+        [f"write:{n}" for n in (1, 2, 4, 7, 8, 9, 11)]
+        + [f"poll:{n}" for n in polls]
+        + [f"seconds:{s}" for s in seconds]
+    )
     ended_by = kill_runs(sequence, quick(), tmp_path, cases)
     assert len(ended_by) == len(cases)
     for name, number in ended_by.items():
@@ -254,20 +260,3 @@ def test_a_killed_run_resumes_to_the_same_result(
             assert len(temporary_files(run_dir)) == 1
         run_sound(sequence, run_dir, quick(), resume=True)
         assert_same_result(run_dir, undisturbed)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs fork and SIGKILL")
-def test_a_run_killed_among_its_clouds_leaves_no_temporary_file(
-    tmp_path: Path, sequence: Sequence, undisturbed: Path
-) -> None:
-    with_clouds = quick("output.clouds=true")
-    assert kill_runs(sequence, with_clouds, tmp_path, ["write:14"]) == {"write-14": signal.SIGKILL}
-    run_dir = tmp_path / "write-14"
-    left = temporary_files(run_dir)
-    assert len(left) == 1
-    assert left[0].startswith("clouds/dynamic/.tmp-")
-    run_sound(sequence, run_dir, with_clouds, resume=True)
-    assert_same_result(run_dir, undisturbed)
-    folder = RunFolder(run_dir)
-    assert all(folder.dynamic_cloud(t).exists() for t in range(sequence.num_frames))
-    check_run(run_dir, sequence)
