@@ -136,7 +136,6 @@ def test_a_disk_that_is_really_full(small_disk: Path, sequence: Sequence, comple
     assert_same_result(run_dir, complete)
 
 
-@pytest.mark.xfail(reason="Open3D reports success when the disk is full", strict=True)
 @pytest.mark.skipif(sys.platform != "linux", reason="needs tmpfs")
 def test_clouds_on_a_disk_that_is_really_full(small_disk: Path, sequence: Sequence, complete: Path) -> None:
     run_dir = small_disk / "run"

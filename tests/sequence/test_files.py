@@ -50,9 +50,7 @@ def test_disk_full_is_one_clear_sentence(tmp_path: Path) -> None:
     target = tmp_path / "a.txt"
     with pytest.raises(OutputError) as raised:
         write_half_then_raise(target, OSError(errno.ENOSPC, "No space left on device"))
-    assert str(raised.value) == (
-        f"cannot write {target}: No space left on device; free space or choose another --out"
-    )
+    assert str(raised.value) == (f"cannot write {target}: No space left on device; free space or choose another --out")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -171,9 +169,7 @@ def test_zip_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_header_that_lies_about_its_size(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w") as archive, archive.open("a.npy", "w") as stream:
-        np.lib.format.write_array_header_1_0(
-            stream, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 10**6)}
-        )
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 10**6)})
     with pytest.raises(InputError, match="cut short"):
         load_npz(path, {"a": 2})
 

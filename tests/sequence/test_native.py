@@ -104,9 +104,7 @@ def test_only_the_necessary(tmp_path: Path) -> None:
     assert not read.masks[3].any()
 
 
-@pytest.mark.parametrize(
-    "names", [("b", "a", "c", "d"), ("a", "a", "b", "c"), ("a", "../b", "c", "d"), ("x",)]
-)
+@pytest.mark.parametrize("names", [("b", "a", "c", "d"), ("a", "a", "b", "c"), ("a", "../b", "c", "d"), ("x",)])
 def test_names_that_would_change_the_order_become_numbers(tmp_path: Path, names: tuple[str, ...]) -> None:
     written = dataclasses.replace(sample_sequence(), frame_names=names)
     write_native(written, tmp_path / "a")
@@ -139,9 +137,7 @@ def test_depth_choices(tmp_path: Path) -> None:
     (root / "other.npy").write_bytes(b"")
     with pytest.raises(InputError, match=r"has two depth cues, other and other\.npy"):
         read_native(root, depth="other")
-    with pytest.raises(
-        InputError, match=r"neither nothing/ nor nothing\.npy is there \(found depth_gt/, masks/"
-    ):
+    with pytest.raises(InputError, match=r"neither nothing/ nor nothing\.npy is there \(found depth_gt/, masks/"):
         read_native(root, depth="nothing")
 
 
@@ -170,9 +166,7 @@ def test_observations_outside_the_image_are_not_visible(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.visible[0], [True, False, False, False])
     np.testing.assert_array_equal(np.isnan(read.uv[..., 0]), ~read.visible)
     np.testing.assert_array_equal(read.uv[0, 0], [WIDTH - 1, HEIGHT - 1])
-    assert any(
-        "2 visible observations lie outside" in f.message for f in validate_sequence(root).of("warning")
-    )
+    assert any("2 visible observations lie outside" in f.message for f in validate_sequence(root).of("warning"))
 
 
 def pose_change(frame: int, row: object) -> Callable[[Path], None]:
@@ -319,9 +313,7 @@ def test_zero_bottom_rows_are_repaired_and_rounding_removed(tmp_path: Path) -> N
     assert poses is not None
     np.testing.assert_allclose(poses, expected, atol=2e-5)
     rotation = poses[:, :3, :3]
-    np.testing.assert_allclose(
-        rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-14
-    )
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-14)
 
 
 def test_missing_root(tmp_path: Path) -> None:

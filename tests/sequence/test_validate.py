@@ -84,9 +84,7 @@ def test_depth_that_is_missing_or_in_the_wrong_unit(tmp_path: Path) -> None:
     sparse = np.zeros((FRAMES, HEIGHT, WIDTH), np.float32)
     sparse[:, :3] = 1
     np.save(root / "depth.npy", sparse)
-    assert [m for _, m in said_of(root, "depth", "warning")] == [
-        f"{root / 'depth.npy'}: 75 % of the depth is missing"
-    ]
+    assert [m for _, m in said_of(root, "depth", "warning")] == [f"{root / 'depth.npy'}: 75 % of the depth is missing"]
 
 
 def said_of(root: Path, depth: str, severity: str) -> list[tuple[str, str]]:
@@ -143,9 +141,7 @@ def test_cues_named_after_other_frames(tmp_path: Path) -> None:
 def test_intrinsics(tmp_path: Path) -> None:
     root = native_folder(tmp_path)
     np.save(root / "K.npy", np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]]))
-    assert (
-        "principal point (320.0, 240.0) lies outside the image of 16 x 12 px" in said(root, "warning")[0][1]
-    )
+    assert "principal point (320.0, 240.0) lies outside the image of 16 x 12 px" in said(root, "warning")[0][1]
     (root / "K.npy").unlink()
     assert said(root, "warning") == [("intrinsics", "there is no K.npy: a focal length of 16 px is guessed")]
 

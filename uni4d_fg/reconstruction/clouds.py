@@ -39,7 +39,7 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
     cloud.point.colors = open3d.core.Tensor(np.ascontiguousarray(colors, dtype=np.uint8))
     quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
     with atomic_path(path) as temporary, quiet:
-        if not open3d.t.io.write_point_cloud(str(temporary), cloud):
+        if not open3d.t.io.write_point_cloud(str(temporary), cloud) or not _is_whole(temporary, len(points)):
             raise OutputError(f"cannot write {path}: Open3D failed; check free space and the folder's permissions")
 
 
@@ -87,6 +87,13 @@ def write_clouds(
         write_ply(folder.dynamic_cloud(frame), *cloud)
         count += 1
     return count
+
+
+def _is_whole(path: Path, count: int) -> bool:
+    """Tell whether a PLY of ``count`` coloured points is complete: Open3D does not notice a full disk."""
+    content = path.read_bytes()
+    header, found, _ = content.partition(b"end_header\n")
+    return bool(found) and len(content) - len(header) - len(found) == count * (3 * 4 + 3)
 
 
 def _write_empty(path: Path) -> None:

@@ -346,5 +346,6 @@ def _spatial_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig
     score = np.nanmedian(nearest[rated], axis=1)
     for label in np.unique(mesh.instance[rated]).tolist():
         mine = mesh.instance[rated] == label
-        keep[rated[mine]] = score[mine] <= config.max_neighbour_ratio * np.median(score[mine])
+        typical = max(float(np.median(score[mine])), config.arap_sigma_m)  # coinciding tracks have none
+        keep[rated[mine]] = score[mine] <= config.max_neighbour_ratio * typical
     return keep
