@@ -104,20 +104,10 @@ def bundle_adjustment_stage(
     """
     num_frames = len(state["pose"])
     _, row = observations.rows()
-    slots = (Slot("pose", observations.frame), Slot("landmark", row), Slot("intrinsics", np.zeros_like(row)))
     weight = observations.weight
     if unsquared:
         weight = reprojection_weights(observations.frame, weight, num_frames, normalization)
-    batches = [
-        FactorBatch.create(
-            STATIC_REPROJECTION,
-            slots,
-            {"uv": observations.uv},
-            sigma=1.0 if unsquared else noise.reprojection_sigma_px,
-            weight=weight,
-            kernel=kernel_of(config.reprojection_kernel),
-        )
-    ]
+    batches = [_reprojection_term(observations, row, 1.0 if unsquared else noise.reprojection_sigma_px, weight, config)]
     batches += camera_motion_terms(np.arange(num_frames), config.camera_motion, unsquared)
     free: dict[str, BoolArray] = {"landmark": np.ones((len(state["landmark"]), 3), dtype=bool)}
     if freedom.poses:
@@ -149,21 +139,27 @@ def structure_stage(
     """
     num_frames = len(state["pose"])
     _, row = observations.rows()
-    slots = (Slot("pose", observations.frame), Slot("landmark", row), Slot("intrinsics", np.zeros_like(row)))
-    reprojection = FactorBatch.create(
-        STATIC_REPROJECTION,
-        slots,
-        {"uv": observations.uv},
-        sigma=noise.reprojection_sigma_px,
-        weight=observations.weight,
-        kernel=kernel_of(config.reprojection_kernel),
-    )
+    reprojection = _reprojection_term(observations, row, noise.reprojection_sigma_px, observations.weight, config)
     depth = depth_prior_terms(observations, row, min(noise.depth_sigma, config.depth_sigma), num_frames, config)
     free = {
         "landmark": np.ones((len(state["landmark"]), 3), dtype=bool),
         "log_scale": np.ones((num_frames, 1), dtype=bool),
     }
     return Stage("structure", (reprojection, *depth), free, config.solver, "schur", eliminate="landmark")
+
+
+def _reprojection_term(
+    observations: Observations, row: IntArray, sigma: float, weight: FloatArray, config: BundleAdjustmentConfig
+) -> FactorBatch:
+    """Return E_BA; ``row`` (N,) is the landmark row of each observation."""
+    return FactorBatch.create(
+        STATIC_REPROJECTION,
+        (Slot("pose", observations.frame), Slot("landmark", row), Slot("intrinsics", np.zeros_like(row))),
+        {"uv": observations.uv},
+        sigma=sigma,
+        weight=weight,
+        kernel=kernel_of(config.reprojection_kernel),
+    )
 
 
 def depth_prior_terms(
@@ -307,13 +303,17 @@ def _hold_metric_scale(state: State) -> State:
     return state.replace(pose=poses, landmark=landmarks, log_scale=state["log_scale"] - shift)
 
 
+def _reprojection_residual(state: State, observations: Observations, row: IntArray) -> FloatArray:
+    """Return the raw reprojection residual of every observation, (N, 2) px; ``row`` is its landmark's row."""
+    pose, landmark = state["pose"][observations.frame], state["landmark"][row]
+    residual: FloatArray = STATIC_REPROJECTION.residual(pose, landmark, state["intrinsics"], uv=observations.uv)
+    return residual
+
+
 def _landmark_error(state: State, observations: Observations) -> Float32Array:
     """Return each landmark's median reprojection error, (N,) px."""
     tracks, row = observations.rows()
-    residual = STATIC_REPROJECTION.residual(
-        state["pose"][observations.frame], state["landmark"][row], state["intrinsics"][[0] * len(row)],
-        uv=observations.uv,
-    )  # fmt: skip
+    residual = _reprojection_residual(state, observations, row)
     norm = np.linalg.norm(residual, axis=1)
     order = np.lexsort([norm, row])
     start = np.searchsorted(row[order], np.arange(len(tracks) + 1))
@@ -359,10 +359,7 @@ def _drop_outliers(
     """Drop observations behind the camera, too far off, or of landmarks whose depth contradicts the cue."""
     tracks, row = observations.rows()
     z = world_to_camera(state["pose"][observations.frame], state["landmark"][row])[:, 2]
-    residual = STATIC_REPROJECTION.residual(
-        state["pose"][observations.frame], state["landmark"][row], state["intrinsics"][[0] * len(row)],
-        uv=observations.uv,
-    )  # fmt: skip
+    residual = _reprojection_residual(state, observations, row)
     behind = z <= NEAR_PLANE
     far = ~behind & (np.linalg.norm(residual, axis=1) > config.max_reprojection_px)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -392,7 +389,7 @@ def _measure(
     """Measure the noise of the static scene from what is left."""
     _, row = observations.rows()
     pose, landmark = state["pose"][observations.frame], state["landmark"][row]
-    reprojection = STATIC_REPROJECTION.residual(pose, landmark, state["intrinsics"][[0] * len(row)], uv=observations.uv)
+    reprojection = _reprojection_residual(state, observations, row)
     known = np.isfinite(observations.depth)
     depth = STATIC_DEPTH_PRIOR.residual(
         pose[known], landmark[known], state["log_scale"][observations.frame[known]], depth=observations.depth[known]
