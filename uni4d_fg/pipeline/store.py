@@ -34,14 +34,15 @@ class StageStore:
         """Return the file of a stage."""
         return self.folder / f"{name}.npz"
 
-    def load(self, name: str, key: str) -> StageRecord | None:
-        """Return a stage's record if it is there, readable and of this key."""
+    def load(self, name: str, key: str | None = None) -> StageRecord | None:
+        """Return a stage's record if it is there, readable and of this key (any key when None)."""
         path = self.path(name)
         if not path.exists():
             return None
         try:
             arrays = load_npz(path, {"key": None, "summary": None})
-            if str(arrays.pop("key")) != key:
+            stored = str(arrays.pop("key"))
+            if key is not None and stored != key:
                 return None
             return StageRecord(arrays, json.loads(str(arrays.pop("summary"))))
         except (InputError, ValueError, KeyError):

@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import SolverError
@@ -35,6 +35,8 @@ class Hooks:
     """Called with (name, iteration, energy) after every accepted step."""
     should_stop: Callable[[], bool] | None = None
     """Polled before every linearisation; True ends the solve with the best state so far."""
+    on_state: Callable[[Any], None] | None = None
+    """Called with the state after every accepted step; states are never modified afterwards."""
 
 
 @dataclass
@@ -133,6 +135,8 @@ def minimize(
         state, energies, energy = accepted, trial_energies, trial_energy
         assert step is not None
         records.append(IterationRecord(energy, clock.elapsed(), damping, rejected, step.inner_iterations))
+        if hooks.on_state is not None:
+            hooks.on_state(state)
         if hooks.on_iteration is not None:
             hooks.on_iteration(name, len(records), energy)
         if decrease < config.relative_decrease:
