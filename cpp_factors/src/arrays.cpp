@@ -1,0 +1,163 @@
+#include "arrays.hpp"
+
+#include <limits>
+#include <new>
+
+#include "uni4d_fg/parallel.hpp"
+
+namespace uni4d_fg {
+
+namespace {
+
+std::string dtype_name(nb::dlpack::dtype dtype) {
+  const char* kind = "dtype";
+  switch (static_cast<nb::dlpack::dtype_code>(dtype.code)) {
+    case nb::dlpack::dtype_code::Int: kind = "int"; break;
+    case nb::dlpack::dtype_code::UInt: kind = "uint"; break;
+    case nb::dlpack::dtype_code::Float: kind = "float"; break;
+    case nb::dlpack::dtype_code::Complex: kind = "complex"; break;
+    case nb::dlpack::dtype_code::Bool: return "bool";
+    default: break;
+  }
+  return kind + std::to_string(static_cast<int>(dtype.bits));
+}
+
+std::string shape_text(const std::vector<std::int64_t>& shape) {
+  std::string text = "(";
+  for (std::size_t i = 0; i < shape.size(); ++i) {
+    if (i > 0) text += ", ";
+    text += shape[i] == kAnyLength ? "N" : std::to_string(shape[i]);
+  }
+  return text + (shape.size() == 1 ? ",)" : ")");
+}
+
+std::vector<std::int64_t> shape_of(const AnyArray& array) {
+  std::vector<std::int64_t> shape;
+  for (std::size_t i = 0; i < array.ndim(); ++i) shape.push_back(static_cast<std::int64_t>(array.shape(i)));
+  return shape;
+}
+
+bool contiguous(const AnyArray& array) {
+  std::int64_t expected = 1;
+  for (std::size_t i = array.ndim(); i-- > 0;) {
+    const auto length = static_cast<std::int64_t>(array.shape(i));
+    if (length == 0) return true;
+    if (length != 1 && array.stride(i) != expected) return false;
+    expected *= length;
+  }
+  return true;
+}
+
+template <typename T>
+View<T> expect(const AnyArray& array, const char* name, const std::vector<std::int64_t>& expected, const char* dtype) {
+  const std::vector<std::int64_t> shape = shape_of(array);
+  bool fits = shape.size() == expected.size() && array.dtype() == nb::dtype<T>();
+  for (std::size_t i = 0; fits && i < shape.size(); ++i) fits = expected[i] == kAnyLength || expected[i] == shape[i];
+  const bool dense = contiguous(array);
+  if (!fits || !dense)
+    refuse(std::string(name) + ": expected " + dtype + " " + shape_text(expected) + " C-contiguous, got " +
+           dtype_name(array.dtype()) + " " + shape_text(shape) + (dense ? "" : " with strides"));
+  return {static_cast<const T*>(array.data()), shape};
+}
+
+}  // namespace
+
+void refuse(const std::string& message) { throw nb::value_error(message.c_str()); }
+
+template <typename T>
+std::int64_t View<T>::size() const {
+  std::int64_t size = 1;
+  for (const std::int64_t length : shape) size *= length;
+  return size;
+}
+template struct View<double>;
+template struct View<std::int64_t>;
+
+View<double> expect_floats(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape,
+                           bool finite) {
+  View<double> view = expect<double>(array, name, shape, "float64");
+  if (finite) {
+    const std::int64_t size = view.size();
+    // x - x is 0 for a finite x and NaN otherwise: a sum that the compiler can turn into vector code.
+    double differences[4] = {0.0, 0.0, 0.0, 0.0};
+    std::int64_t i = 0;
+    for (; i + 4 <= size; i += 4)
+      for (int lane = 0; lane < 4; ++lane) differences[lane] += view.data[i + lane] - view.data[i + lane];
+    for (; i < size; ++i) differences[0] += view.data[i] - view.data[i];
+    if (!(differences[0] + differences[1] + differences[2] + differences[3] == 0.0)) {
+      for (i = 0; i < size; ++i)
+        if (!std::isfinite(view.data[i]))
+          refuse(std::string(name) + ": every value must be finite; value " + std::to_string(i) + " (flat index) is not");
+    }
+  }
+  return view;
+}
+
+View<std::int64_t> expect_rows(const AnyArray& array, const char* name, std::int64_t length, std::int64_t limit) {
+  View<std::int64_t> view = expect<std::int64_t>(array, name, {length}, "int64");
+  for (std::int64_t i = 0; i < view.rows(); ++i)
+    if (view.data[i] < 0 || view.data[i] >= limit)
+      refuse(std::string(name) + ": entry " + std::to_string(i) + " is " + std::to_string(view.data[i]) +
+             ", outside [0, " + std::to_string(limit) + ")");
+  return view;
+}
+
+void expect_positive(const View<double>& view, const char* name) {
+  for (std::int64_t i = 0; i < view.size(); ++i)
+    if (!(view.data[i] > 0.0))
+      refuse(std::string(name) + ": every value must be positive; value " + std::to_string(i) + " is " +
+             std::to_string(view.data[i]));
+}
+
+Sigma expect_sigma(const AnyArray& array, const char* name, std::int64_t length, int dim) {
+  Sigma sigma;
+  if (array.ndim() == 2) {
+    sigma.view = expect_floats(array, name, {length, dim});
+    sigma.columns = dim;
+  } else {
+    sigma.view = expect_floats(array, name, {length});
+  }
+  expect_positive(sigma.view, name);
+  return sigma;
+}
+
+View<double> expect_weights(const AnyArray& array, const char* name, std::int64_t length) {
+  View<double> view = expect_floats(array, name, {length});
+  for (std::int64_t i = 0; i < view.rows(); ++i)
+    if (view.data[i] < 0.0)
+      refuse(std::string(name) + ": weights must not be negative; weight " + std::to_string(i) + " is " +
+             std::to_string(view.data[i]));
+  return view;
+}
+
+Kernel expect_kernel(int kind, double threshold) {
+  if (kind < 0 || kind >= kKernelKinds)
+    refuse("kernel: expected a code in [0, " + std::to_string(kKernelKinds) + "), got " + std::to_string(kind));
+  if (!(threshold > 0.0) || !std::isfinite(threshold))
+    refuse("threshold: expected a positive number, got " + std::to_string(threshold));
+  return {static_cast<KernelKind>(kind), threshold};
+}
+
+int expect_threads(int threads) {
+  if (threads < 0) refuse("threads: expected 0 (the cores) or a positive number, got " + std::to_string(threads));
+  return resolve_threads(threads);
+}
+
+int expect_count(std::int64_t count, const char* name) {
+  if (count < 0 || count > std::numeric_limits<int>::max())
+    refuse(std::string(name) + ": " + std::to_string(count) + " rows are too many");
+  return static_cast<int>(count);
+}
+
+NewArray::NewArray(std::vector<std::size_t> shape) : shape_(std::move(shape)) {
+  std::size_t size = 1;
+  for (const std::size_t length : shape_) size *= length;
+  data_ = new double[size > 0 ? size : 1];
+  owner_ = nb::capsule(data_, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+}
+
+nb::ndarray<nb::numpy, double> NewArray::release() {
+  return nb::ndarray<nb::numpy, double>(data_, shape_.size(), shape_.data(), owner_);
+}
+
+}  // namespace uni4d_fg

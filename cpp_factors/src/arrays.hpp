@@ -1,0 +1,81 @@
+// The boundary with Python: every array is checked here, with a message that names the argument.
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <cmath>
+#include <cstdint>
+#include <initializer_list>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "uni4d_fg/robust.hpp"
+
+namespace uni4d_fg {
+
+namespace nb = nanobind;
+
+/// Any array on the CPU; what it holds is checked by the functions below.
+using AnyArray = nb::ndarray<nb::ro, nb::device::cpu>;
+
+/// A length that `expect_*` accepts whatever it is.
+constexpr std::int64_t kAnyLength = -1;
+
+/// What is known about an array that passed: a pointer to C-contiguous values and its shape.
+template <typename T>
+struct View {
+  const T* data = nullptr;
+  std::vector<std::int64_t> shape;
+  std::int64_t rows() const { return shape.empty() ? 0 : shape[0]; }
+  /// Number of values.
+  std::int64_t size() const;
+};
+
+/// Check dtype float64, C-contiguity, shape (kAnyLength leaves an axis open) and, if asked, that all is finite.
+/// Raises ValueError "name: expected float64 (N, 2) C-contiguous, got float32 (5, 2)".
+View<double> expect_floats(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape,
+                           bool finite = true);
+
+/// Check dtype int64, C-contiguity, shape (n,) and that every entry lies in [0, limit).
+View<std::int64_t> expect_rows(const AnyArray& array, const char* name, std::int64_t length, std::int64_t limit);
+
+/// Check a sigma: (n,) or (n, dim), finite and positive. `columns` is 1 or dim.
+struct Sigma {
+  View<double> view;
+  int columns = 1;
+};
+Sigma expect_sigma(const AnyArray& array, const char* name, std::int64_t length, int dim);
+
+/// Check weights: (n,), finite and not negative.
+View<double> expect_weights(const AnyArray& array, const char* name, std::int64_t length);
+
+/// Check a kernel code and a threshold > 0.
+Kernel expect_kernel(int kind, double threshold);
+
+/// Raise ValueError unless every value is positive.
+void expect_positive(const View<double>& view, const char* name);
+
+/// Check a number of threads (0: the cores) and return the number of workers.
+int expect_threads(int threads);
+
+/// Raise ValueError when a count does not fit an int.
+int expect_count(std::int64_t count, const char* name);
+
+[[noreturn]] void refuse(const std::string& message);
+
+/// Hand a new C-contiguous float64 array to Python. Take the GIL before.
+class NewArray {
+ public:
+  explicit NewArray(std::vector<std::size_t> shape);
+  double* data() { return data_; }
+  nb::ndarray<nb::numpy, double> release();
+
+ private:
+  std::vector<std::size_t> shape_;
+  double* data_;
+  nb::capsule owner_;
+};
+
+}  // namespace uni4d_fg

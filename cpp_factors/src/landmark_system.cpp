@@ -1,0 +1,1 @@
+#include "uni4d_fg/math.hpp"

@@ -1,0 +1,20 @@
+#include <nanobind/nanobind.h>
+
+namespace nb = nanobind;
+
+namespace uni4d_fg {
+void bind_batches(nb::module_& module);
+void bind_pair_system(nb::module_& module);
+void bind_landmark_system(nb::module_& module);
+void bind_trajectory_system(nb::module_& module);
+}  // namespace uni4d_fg
+
+NB_MODULE(_core, module) {
+  module.doc() = "C++ factors and linear solvers for uni4d_fg.";
+  // Raised by every change of a signature or of a meaning.
+  module.attr("ABI") = 1;
+  uni4d_fg::bind_batches(module);
+  uni4d_fg::bind_pair_system(module);
+  uni4d_fg::bind_landmark_system(module);
+  uni4d_fg::bind_trajectory_system(module);
+}

@@ -1,0 +1,379 @@
+// Energies and the quadratic model of a TrajectorySystem.
+#include "uni4d_fg/trajectory_system.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "uni4d_fg/factors/arap.hpp"
+#include "uni4d_fg/factors/depth_prior.hpp"
+#include "uni4d_fg/factors/dynamic_reprojection.hpp"
+#include "uni4d_fg/factors/temporal_smoothness.hpp"
+#include "uni4d_fg/parallel.hpp"
+
+namespace uni4d_fg {
+namespace {
+
+constexpr int kRangeSize = 4096;
+/// Places of the entries of a symmetric 3x3 block in its six stored values.
+constexpr int kRowOf[6] = {0, 0, 0, 1, 1, 2};
+constexpr int kColumnOf[6] = {0, 1, 2, 1, 2, 2};
+
+UNI4D_FG_INLINE const double* smoothness_jacobian(int slots) {
+  return slots == 2 ? temporal_smoothness::kVelocityJacobian : temporal_smoothness::kAccelerationJacobian;
+}
+
+UNI4D_FG_INLINE void smoothness_residual(const double* points, const std::int32_t* rows, int slots, double* r) {
+  const double* a = points + 3 * rows[0];
+  const double* b = points + 3 * rows[1];
+  if (slots == 2) {
+    temporal_smoothness::velocity_residual(load_vec3(a), load_vec3(b), r);
+  } else {
+    temporal_smoothness::acceleration_residual(load_vec3(a), load_vec3(b), load_vec3(points + 3 * rows[2]), r);
+  }
+}
+
+/// Add scale * a b^T, both 3-vectors, to a full block of nine values.
+UNI4D_FG_INLINE void add_outer(double scale, const double* a, const double* b, double* block) {
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) block[3 * i + j] += scale * a[i] * b[j];
+  }
+}
+
+/// Add scale * a a^T to a symmetric block of six values.
+UNI4D_FG_INLINE void add_square(double scale, const double* a, double* block) {
+  for (int i = 0; i < 6; ++i) block[i] += scale * a[kRowOf[i]] * a[kColumnOf[i]];
+}
+
+int num_ranges(std::size_t count) { return static_cast<int>((count + kRangeSize - 1) / kRangeSize); }
+
+}  // namespace
+
+std::vector<double> TrajectorySystem::energies(const double* points) const {
+  const int edge_ranges = num_ranges(edge_low_.size());
+  parallel_for(edge_ranges, threads_, [&](int begin, int end, int) {
+    const std::size_t stop = std::min(edge_low_.size(), static_cast<std::size_t>(end) * kRangeSize);
+    for (std::size_t e = static_cast<std::size_t>(begin) * kRangeSize; e < stop; ++e) {
+      distance_[e] = arap::smooth_distance(load_vec3(points + 3 * edge_low_[e]) - load_vec3(points + 3 * edge_high_[e]));
+    }
+  });
+  // Every range of factors has its own sum, added in order below.
+  std::vector<std::int32_t> first_range(1, 0);
+  for (const Batch& batch : batches_) first_range.push_back(first_range.back() + num_ranges(batch.weight.size()));
+  std::vector<double> sums(static_cast<std::size_t>(first_range.back()));
+  parallel_for(first_range.back(), threads_, [&](int begin, int end, int) {
+    for (int range = begin; range < end; ++range) {
+      const auto index = static_cast<std::size_t>(
+          std::upper_bound(first_range.begin(), first_range.end(), range) - first_range.begin() - 1);
+      const std::int32_t start = (range - first_range[index]) * kRangeSize;
+      sums[static_cast<std::size_t>(range)] =
+          energy_of(batches_[index], start, std::min(start + kRangeSize, batches_[index].size()), points);
+    }
+  });
+  std::vector<double> out(batches_.size(), 0.0);
+  for (std::size_t b = 0; b < batches_.size(); ++b) {
+    for (std::int32_t range = first_range[b]; range < first_range[b + 1]; ++range) {
+      out[b] += sums[static_cast<std::size_t>(range)];
+    }
+  }
+  return out;
+}
+
+double TrajectorySystem::energy_of(const Batch& batch, std::int32_t begin, std::int32_t end,
+                                   const double* points) const {
+  double sum = 0.0;
+  for (std::int32_t i = begin; i < end; ++i) {
+    const auto n = static_cast<std::size_t>(i);
+    const double* inverse_sigma = &batch.inverse_sigma[n * static_cast<std::size_t>(batch.dim)];
+    double r[3], squared = 0.0;
+    switch (batch.kind) {
+      case Kind::kReprojection: {
+        const FrozenCamera& camera = cameras_[static_cast<std::size_t>(batch.camera[n])];
+        dynamic_reprojection::residual(camera.pose, load_vec3(points + 3 * batch.rows[n]), camera.intrinsics,
+                                       &batch.observed[2 * n], r);
+        squared = whiten<2>(r, inverse_sigma);
+        break;
+      }
+      case Kind::kDepth: {
+        const Pose& pose = cameras_[static_cast<std::size_t>(batch.camera[n])].pose;
+        depth_prior::residual(pose, load_vec3(points + 3 * batch.rows[n]), 0.0, batch.observed[n], r);
+        squared = whiten<1>(r, inverse_sigma);
+        break;
+      }
+      case Kind::kSmoothness:
+        smoothness_residual(points, &batch.rows[n * static_cast<std::size_t>(batch.slots)], batch.slots, r);
+        squared = whiten<3>(r, inverse_sigma);
+        break;
+      case Kind::kArap: {
+        const std::size_t f = static_cast<std::size_t>(batch.first_factor) + n;
+        r[0] = distance_[static_cast<std::size_t>(factor_now_[f])] - distance_[static_cast<std::size_t>(factor_after_[f])];
+        squared = whiten<1>(r, inverse_sigma);
+      }
+    }
+    sum += batch.weight[n] * rho(batch.kernel, squared);
+  }
+  return sum;
+}
+
+NonFinite TrajectorySystem::linearize(const double* points) {
+  linearized_ = false;
+  std::fill(gradient_.begin(), gradient_.end(), 0.0);
+  std::fill(inside_.begin(), inside_.end(), 0.0);
+  std::vector<NonFinite> bad(static_cast<std::size_t>(threads_) + 1);
+  linearize_edges(points);
+  linearize_arap(bad);
+  sum_over_edges();
+  parallel_for(num_chunks_, threads_, [&](int begin, int end, int worker) {
+    for (int chunk = begin; chunk < end; ++chunk) {
+      for (std::size_t b = 0; b < batches_.size(); ++b) {
+        if (batches_[b].kind != Kind::kArap) {
+          linearize_inside(batches_[b], static_cast<int>(b), chunk, points, bad[static_cast<std::size_t>(worker)]);
+        }
+      }
+      gather_arap(chunk);
+    }
+  });
+  add_irregular_arap();
+  loose_scale_.clear();
+  for (std::size_t b = 0; b < batches_.size(); ++b) {
+    if (batches_[b].kind == Kind::kSmoothness) linearize_loose(batches_[b], static_cast<int>(b), points, bad.back());
+  }
+  NonFinite first;
+  for (const NonFinite& candidate : bad) first.merge(candidate);
+  linearized_ = !first.any();
+  return first;
+}
+
+/// Evaluate the distance of every edge and its derivative with respect to the lower row.
+void TrajectorySystem::linearize_edges(const double* points) {
+  parallel_for(num_ranges(edge_low_.size()), threads_, [&](int begin, int end, int) {
+    const std::size_t stop = std::min(edge_low_.size(), static_cast<std::size_t>(end) * kRangeSize);
+    for (std::size_t e = static_cast<std::size_t>(begin) * kRangeSize; e < stop; ++e) {
+      const Vec3 difference = load_vec3(points + 3 * edge_low_[e]) - load_vec3(points + 3 * edge_high_[e]);
+      const double distance = arap::smooth_distance(difference);
+      distance_[e] = distance;
+      store((1.0 / distance) * difference, &direction_[3 * e]);
+    }
+  });
+}
+
+void TrajectorySystem::linearize_arap(std::vector<NonFinite>& bad) {
+  for (std::size_t b = 0; b < batches_.size(); ++b) {
+    const Batch& batch = batches_[b];
+    if (batch.kind != Kind::kArap) continue;
+    parallel_for(batch.size(), threads_, [&](int begin, int end, int worker) {
+      for (int i = begin; i < end; ++i) {
+        const auto n = static_cast<std::size_t>(i), f = n + static_cast<std::size_t>(batch.first_factor);
+        const double r = distance_[static_cast<std::size_t>(factor_now_[f])] -
+                         distance_[static_cast<std::size_t>(factor_after_[f])];
+        // A direction is not finite only if its distance is not.
+        if (!std::isfinite(r)) bad[static_cast<std::size_t>(worker)].merge({static_cast<int>(b), batch.original[n]});
+        const double inverse_sigma = batch.inverse_sigma[n], whitened = r * inverse_sigma;
+        factor_residual_[f] = r;
+        factor_weight_[f] = batch.weight[n] * weight(batch.kernel, whitened * whitened) * inverse_sigma * inverse_sigma;
+      }
+    });
+  }
+}
+
+/// Sum the weights and forces of the factors that use each distance.
+void TrajectorySystem::sum_over_edges() {
+  parallel_for(num_ranges(edge_low_.size()), threads_, [&](int begin, int end, int) {
+    const std::size_t stop = std::min(edge_low_.size(), static_cast<std::size_t>(end) * kRangeSize);
+    for (std::size_t e = static_cast<std::size_t>(begin) * kRangeSize; e < stop; ++e) {
+      double stiffness = 0.0, diagonal = 0.0, force = 0.0;
+      for (std::int32_t i = entry_start_[e]; i < entry_start_[e + 1]; ++i) {
+        const auto f = static_cast<std::size_t>(entries_[static_cast<std::size_t>(i)].factor);
+        const auto other = static_cast<std::size_t>(entries_[static_cast<std::size_t>(i)].other);
+        stiffness += factor_weight_[f];
+        if (factor_regular_[f]) diagonal += factor_weight_[f];
+        force += factor_weight_[f] * (distance_[e] - distance_[other]);
+      }
+      edge_stiffness_[e] = stiffness;
+      edge_diagonal_[e] = diagonal;
+      edge_force_[e] = force;
+    }
+  });
+}
+
+/// Add the factors of one batch that stay within the tracks of a chunk.
+void TrajectorySystem::linearize_inside(const Batch& batch, int batch_index, int chunk, const double* points,
+                                        NonFinite& bad) {
+  const auto c = static_cast<std::size_t>(chunk);
+  for (std::int32_t i = batch.chunk_start[c]; i < batch.chunk_start[c + 1]; ++i) {
+    const auto n = static_cast<std::size_t>(i);
+    const double* inverse_sigma = &batch.inverse_sigma[n * static_cast<std::size_t>(batch.dim)];
+    double r[3], jacobian[6];
+    if (batch.kind == Kind::kSmoothness) {
+      const std::int32_t* rows = &batch.rows[n * static_cast<std::size_t>(batch.slots)];
+      smoothness_residual(points, rows, batch.slots, r);
+      if (!std::isfinite(r[0] + r[1] + r[2])) bad.merge({batch_index, batch.original[n]});
+      double scale[3];
+      smoothness_scale(batch, n, r, scale);
+      const double* factor = smoothness_jacobian(batch.slots);
+      for (int s = 0; s < batch.slots; ++s) {
+        double* gradient = &gradient_[3 * static_cast<std::size_t>(rows[s])];
+        double* own = &inside_[12 * static_cast<std::size_t>(rows[s])];
+        for (int a = 0; a < 3; ++a) gradient[a] += factor[s] * scale[a] * r[a];
+        for (int t = 0; t < batch.slots; ++t) {
+          const std::int32_t lag = rows[s] - rows[t];
+          if (lag < 0) continue;
+          const double product = factor[s] * factor[t];
+          if (lag == 0) {
+            own[0] += product * scale[0];
+            own[3] += product * scale[1];
+            own[5] += product * scale[2];
+          } else {
+            for (int a = 0; a < 3; ++a) own[3 + 3 * lag + a] += product * scale[a];
+          }
+        }
+      }
+      continue;
+    }
+    const auto row = static_cast<std::size_t>(batch.rows[n]);
+    const FrozenCamera& camera = cameras_[static_cast<std::size_t>(batch.camera[n])];
+    const Vec3 point = load_vec3(points + 3 * row);
+    if (batch.kind == Kind::kReprojection) {
+      dynamic_reprojection::linearize(camera.pose, point, camera.intrinsics, &batch.observed[2 * n], r, jacobian);
+    } else {
+      depth_prior::linearize_point(camera.pose, point, 0.0, batch.observed[n], r, jacobian);
+    }
+    double squared = 0.0, check = 0.0;
+    for (int a = 0; a < batch.dim; ++a) {
+      const double whitened = r[a] * inverse_sigma[a];
+      squared += whitened * whitened;
+      check += r[a] + jacobian[3 * a] + jacobian[3 * a + 1] + jacobian[3 * a + 2];
+    }
+    if (!std::isfinite(check)) bad.merge({batch_index, batch.original[n]});
+    const double robust = batch.weight[n] * weight(batch.kernel, squared);
+    for (int a = 0; a < batch.dim; ++a) {
+      const double scale = robust * inverse_sigma[a] * inverse_sigma[a];
+      for (int k = 0; k < 3; ++k) gradient_[3 * row + static_cast<std::size_t>(k)] += scale * r[a] * jacobian[3 * a + k];
+      add_square(scale, jacobian + 3 * a, &inside_[12 * row]);
+    }
+  }
+}
+
+void TrajectorySystem::smoothness_scale(const Batch& batch, std::size_t n, const double* r, double* scale) const {
+  const double* inverse_sigma = &batch.inverse_sigma[3 * n];
+  double squared = 0.0;
+  for (int a = 0; a < 3; ++a) squared += r[a] * inverse_sigma[a] * r[a] * inverse_sigma[a];
+  const double robust = batch.weight[n] * weight(batch.kernel, squared);
+  for (int a = 0; a < 3; ++a) scale[a] = robust * inverse_sigma[a] * inverse_sigma[a];
+}
+
+/// Copy what factors within a track gave to the blocks of a chunk, and add the part of ARAP.
+void TrajectorySystem::gather_arap(int chunk) {
+  const auto c = static_cast<std::size_t>(chunk);
+  const auto begin = static_cast<std::size_t>(track_start_[static_cast<std::size_t>(chunk_tracks_[c])]);
+  const auto end = static_cast<std::size_t>(track_start_[static_cast<std::size_t>(chunk_tracks_[c + 1])]);
+  for (std::size_t p = begin; p < end; ++p) {
+    const double* own = &inside_[12 * p];
+    double* block = &blocks_[24 * p];
+    double* gradient = &gradient_[3 * p];
+    std::copy_n(own, 6, block);
+    std::fill_n(block + 6, 18, 0.0);
+    for (int a = 0; a < 3; ++a) {
+      block[6 + 4 * a] = own[6 + a];
+      block[15 + 4 * a] = own[9 + a];
+    }
+    const auto add_edge = [&](std::size_t e, double sign) {
+      const double* direction = &direction_[3 * e];
+      const double force = sign * edge_force_[e];
+      for (int a = 0; a < 3; ++a) gradient[a] += force * direction[a];
+      add_square(edge_diagonal_[e], direction, block);
+    };
+    for (std::int32_t e = low_start_[p]; e < low_start_[p + 1]; ++e) add_edge(static_cast<std::size_t>(e), 1.0);
+    for (std::int32_t i = high_start_[p]; i < high_start_[p + 1]; ++i) {
+      add_edge(static_cast<std::size_t>(high_edge_[static_cast<std::size_t>(i)]), -1.0);
+    }
+    for (std::int32_t i = lag_start_[p]; i < lag_start_[p + 1]; ++i) {
+      const LagEntry& entry = lag_entries_[static_cast<std::size_t>(i)];
+      const auto f = static_cast<std::size_t>(entry.factor);
+      const double* now = &direction_[3 * static_cast<std::size_t>(factor_now_[f])];
+      const double* after = &direction_[3 * static_cast<std::size_t>(factor_after_[f])];
+      // The directions enter the residual with opposite signs. Rows of the block are the later point's.
+      add_outer(-factor_weight_[f], entry.after_is_later ? after : now, entry.after_is_later ? now : after,
+                block + (entry.lag == 1 ? 6 : 15));
+    }
+  }
+}
+
+/// Add one product of two slots' Jacobians within a track; rows beyond the bands are left out.
+void TrajectorySystem::add_block(std::int32_t row, std::int32_t column, bool all_lags, double scale, const double* a,
+                                 const double* b) {
+  if (track_of_[static_cast<std::size_t>(row)] != track_of_[static_cast<std::size_t>(column)]) return;
+  const std::int32_t lag = row - column;
+  double* block = &blocks_[24 * static_cast<std::size_t>(row)];
+  if (lag == 0) {
+    for (int i = 0; i < 6; ++i) block[i] += scale * a[kRowOf[i]] * b[kColumnOf[i]];
+  } else if (all_lags && (lag == 1 || lag == 2)) {
+    add_outer(scale, a, b, block + (lag == 1 ? 6 : 15));
+  }
+}
+
+/// Add the blocks of ARAP factors that link a track with itself or points far apart in time; few, if any.
+void TrajectorySystem::add_irregular_arap() {
+  for (const std::int32_t factor : irregular_) {
+    const auto f = static_cast<std::size_t>(factor);
+    const auto now = static_cast<std::size_t>(factor_now_[f]), after = static_cast<std::size_t>(factor_after_[f]);
+    const std::int32_t rows[4] = {edge_low_[now], edge_high_[now], edge_low_[after], edge_high_[after]};
+    const double* directions[4] = {&direction_[3 * now], &direction_[3 * now], &direction_[3 * after], &direction_[3 * after]};
+    const double signs[4] = {1.0, -1.0, -1.0, 1.0};
+    const bool all_lags = complete(rows, 4);
+    for (int i = 0; i < 4; ++i) {
+      for (int j = 0; j < 4; ++j) {
+        add_block(rows[i], rows[j], all_lags, signs[i] * signs[j] * factor_weight_[f], directions[i], directions[j]);
+      }
+    }
+  }
+}
+
+/// Add smoothness factors between tracks or beyond the bands; few, if any.
+void TrajectorySystem::linearize_loose(const Batch& batch, int batch_index, const double* points, NonFinite& bad) {
+  const double* factor = smoothness_jacobian(batch.slots);
+  const double unit[3][3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
+  for (std::int32_t i = batch.first_loose; i < batch.size(); ++i) {
+    const auto n = static_cast<std::size_t>(i);
+    const std::int32_t* rows = &batch.rows[n * static_cast<std::size_t>(batch.slots)];
+    double r[3], scale[3];
+    smoothness_residual(points, rows, batch.slots, r);
+    if (!std::isfinite(r[0] + r[1] + r[2])) bad.merge({batch_index, batch.original[n]});
+    smoothness_scale(batch, n, r, scale);
+    loose_scale_.insert(loose_scale_.end(), scale, scale + 3);
+    const bool all_lags = complete(rows, batch.slots);
+    for (int s = 0; s < batch.slots; ++s) {
+      for (std::size_t a = 0; a < 3; ++a) {
+        gradient_[3 * static_cast<std::size_t>(rows[s]) + a] += factor[s] * scale[a] * r[a];
+        for (int t = 0; t < batch.slots; ++t) {
+          add_block(rows[s], rows[t], all_lags, factor[s] * factor[t] * scale[a], unit[a], unit[a]);
+        }
+      }
+    }
+  }
+}
+
+/// Add the product of the smoothness factors between tracks or beyond the bands with a vector.
+void TrajectorySystem::multiply_loose(const double* vector, double* result) const {
+  std::size_t position = 0;
+  for (const Batch& batch : batches_) {
+    if (batch.kind != Kind::kSmoothness) continue;
+    const double* factor = smoothness_jacobian(batch.slots);
+    for (std::int32_t i = batch.first_loose; i < batch.size(); ++i, position += 3) {
+      const std::int32_t* rows = &batch.rows[static_cast<std::size_t>(i) * static_cast<std::size_t>(batch.slots)];
+      for (std::size_t a = 0; a < 3; ++a) {
+        double product = 0.0;
+        for (int s = 0; s < batch.slots; ++s) product += factor[s] * vector[3 * static_cast<std::size_t>(rows[s]) + a];
+        product *= loose_scale_[position + a];
+        for (int s = 0; s < batch.slots; ++s) result[3 * static_cast<std::size_t>(rows[s]) + a] += factor[s] * product;
+      }
+    }
+  }
+}
+
+std::array<double, 6> TrajectorySystem::diagonal_block(std::int64_t point) const {
+  std::array<double, 6> out;
+  std::copy_n(&blocks_[24 * static_cast<std::size_t>(point)], 6, out.begin());
+  return out;
+}
+
+}  // namespace uni4d_fg
