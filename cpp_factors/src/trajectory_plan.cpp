@@ -143,7 +143,6 @@ void TrajectorySystem::plan_chunks() {
     }
   }
   num_chunks_ = static_cast<int>(chunk_tracks_.size()) - 1;
-  partial_.assign(static_cast<std::size_t>(num_chunks_), 0.0);
 }
 
 /// Whether the blocks of a factor between points of one track all lie within the bands.
@@ -257,7 +256,7 @@ void TrajectorySystem::plan_edges() {
     entries_[static_cast<std::size_t>(next[static_cast<std::size_t>(now)]++)] = {factor, after};
     entries_[static_cast<std::size_t>(next[static_cast<std::size_t>(after)]++)] = {factor, now};
   }
-  for (auto* values : {&distance_, &edge_stiffness_, &edge_force_, &edge_diagonal_, &edge_change_, &edge_tension_}) {
+  for (auto* values : {&distance_, &edge_stiffness_, &edge_force_, &edge_diagonal_}) {
     values->assign(edges, 0.0);
   }
   direction_.assign(3 * edges, 0.0);

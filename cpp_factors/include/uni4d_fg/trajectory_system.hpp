@@ -14,6 +14,7 @@
 #include <cstdint>
 #include <limits>
 #include <optional>
+#include <utility>
 #include <vector>
 
 #include "uni4d_fg/camera.hpp"
@@ -123,7 +124,7 @@ class TrajectorySystem {
   /// A product of two directions that couples a point with an earlier one of its track.
   struct LagEntry {
     std::int32_t factor;
-    bool positive;
+    bool after_is_later;
     std::int8_t lag;
   };
 
@@ -136,18 +137,23 @@ class TrajectorySystem {
   bool complete(const std::int32_t* rows, int slots) const;
   bool regular(std::int32_t factor) const;
 
-  void linearize_inside(const Batch& batch, int batch_index, int chunk, const double* points, NonFinite& bad);
-  void linearize_loose(Batch& batch, int batch_index, const double* points, NonFinite& bad);
+  double energy_of(const Batch& batch, std::int32_t begin, std::int32_t end, const double* points) const;
   void linearize_edges(const double* points);
-  void gather_arap(std::int64_t begin, std::int64_t end);
+  void linearize_arap(std::vector<NonFinite>& bad);
+  void sum_over_edges();
+  void linearize_inside(const Batch& batch, int batch_index, int chunk, const double* points, NonFinite& bad);
+  void smoothness_scale(const Batch& batch, std::size_t n, const double* r, double* scale) const;
+  void gather_arap(int chunk);
+  void add_block(std::int32_t row, std::int32_t column, bool all_lags, double scale, const double* a, const double* b);
   void add_irregular_arap();
-  void edge_products(const double* vector) const;
-  double multiply_chunk(int chunk, const double* vector, const double* diagonal, double* result) const;
+  void linearize_loose(const Batch& batch, int batch_index, const double* points, NonFinite& bad);
   void multiply_loose(const double* vector, double* result) const;
-  bool factorize(double damping, double min_diagonal, double max_diagonal);
+
+  class ConjugateGradients;
+  bool factorize_chunk(int chunk, double damping, double min_diagonal, double max_diagonal);
   void precondition_chunk(int chunk, const double* vector, double* result) const;
-  int conjugate_gradients(double tolerance, int max_iterations, std::vector<double>& x, std::vector<double>& r);
-  double sum_chunks() const;
+  /// Rows [first, second) of the points of a chunk.
+  std::pair<std::size_t, std::size_t> chunk_points(int chunk) const;
 
   std::int64_t num_points_;
   int threads_;
@@ -178,7 +184,6 @@ class TrajectorySystem {
   std::vector<double> factor_weight_, factor_residual_;  ///< (F) squared row scale, and residual in m.
   std::vector<double> edge_stiffness_, edge_force_;     ///< (E) sums over factors.
   std::vector<double> edge_diagonal_;                   ///< (E) as edge_stiffness_, regular factors only.
-  mutable std::vector<double> edge_change_, edge_tension_;
 
   std::vector<double> gradient_;      ///< (3 P)
   std::vector<double> inside_;        ///< (P, 12) J^T J of factors within a track: block, and diagonals of lags 1, 2.
@@ -186,7 +191,6 @@ class TrajectorySystem {
   std::vector<double> loose_scale_;   ///< Smoothness beyond the bands: squared row scales (factors, 3).
   std::vector<double> added_;         ///< (3 P) damping.
   std::vector<double> factor_;        ///< (P, 24) Cholesky: inverse of the diagonal block, lags 1 and 2.
-  mutable std::vector<double> partial_;
 };
 
 }  // namespace uni4d_fg
