@@ -9,6 +9,27 @@ namespace uni4d_fg {
 
 namespace {
 
+using Imported = nb::ndarray<nb::ro, nb::device::cpu>;
+
+Imported import(const AnyArray& argument, const char* name) {
+  const nb::object& object = argument.object;
+  // Only plain numbers reach nanobind's import: strings and dates have no DLPack type.
+  Imported array;
+  std::string got = nb::inst_name(object).c_str();
+  bool numeric = false;
+  if (nb::hasattr(object, "dtype") && nb::hasattr(object.attr("dtype"), "kind")) {
+    const nb::object dtype = object.attr("dtype");
+    const nb::str kind(dtype.attr("kind"));
+    numeric = std::string("biufc").find(kind.c_str()) != std::string::npos && nb::cast<bool>(dtype.attr("isnative"));
+    got += std::string(" of ") + nb::str(dtype).c_str();
+  }
+  if (!numeric || !nb::try_cast(object, array, false) || !array.is_valid()) {
+    PyErr_Clear();
+    throw nb::type_error((std::string(name) + ": expected a numeric NumPy array, got " + got).c_str());
+  }
+  return array;
+}
+
 std::string dtype_name(nb::dlpack::dtype dtype) {
   const char* kind = "dtype";
   switch (static_cast<nb::dlpack::dtype_code>(dtype.code)) {
@@ -31,17 +52,18 @@ std::string shape_text(const std::vector<std::int64_t>& shape) {
   return text + (shape.size() == 1 ? ",)" : ")");
 }
 
-std::vector<std::int64_t> shape_of(const AnyArray& array) {
+std::vector<std::int64_t> shape_of(const Imported& array) {
   std::vector<std::int64_t> shape;
   for (std::size_t i = 0; i < array.ndim(); ++i) shape.push_back(static_cast<std::int64_t>(array.shape(i)));
   return shape;
 }
 
-bool contiguous(const AnyArray& array) {
+bool contiguous(const Imported& array) {
+  for (std::size_t i = 0; i < array.ndim(); ++i)
+    if (array.shape(i) == 0) return true;
   std::int64_t expected = 1;
   for (std::size_t i = array.ndim(); i-- > 0;) {
     const auto length = static_cast<std::int64_t>(array.shape(i));
-    if (length == 0) return true;
     if (length != 1 && array.stride(i) != expected) return false;
     expected *= length;
   }
@@ -49,7 +71,10 @@ bool contiguous(const AnyArray& array) {
 }
 
 template <typename T>
-View<T> expect(const AnyArray& array, const char* name, const std::vector<std::int64_t>& expected, const char* dtype) {
+View<T> expect(const AnyArray& argument, const char* name, const std::vector<std::int64_t>& expected,
+               const char* dtype) {
+  // The values stay alive with the argument itself; the import only looks at them.
+  const Imported array = import(argument, name);
   const std::vector<std::int64_t> shape = shape_of(array);
   bool fits = shape.size() == expected.size() && array.dtype() == nb::dtype<T>();
   for (std::size_t i = 0; fits && i < shape.size(); ++i) fits = expected[i] == kAnyLength || expected[i] == shape[i];
@@ -61,6 +86,8 @@ View<T> expect(const AnyArray& array, const char* name, const std::vector<std::i
 }
 
 }  // namespace
+
+std::size_t num_axes(const AnyArray& array, const char* name) { return import(array, name).ndim(); }
 
 void refuse(const std::string& message) { throw nb::value_error(message.c_str()); }
 
@@ -111,7 +138,7 @@ void expect_positive(const View<double>& view, const char* name) {
 
 Sigma expect_sigma(const AnyArray& array, const char* name, std::int64_t length, int dim) {
   Sigma sigma;
-  if (array.ndim() == 2) {
+  if (num_axes(array, name) == 2) {
     sigma.view = expect_floats(array, name, {length, dim});
     sigma.columns = dim;
   } else {

@@ -17,8 +17,11 @@ namespace uni4d_fg {
 
 namespace nb = nanobind;
 
-/// Any array on the CPU; what it holds is checked by the functions below.
-using AnyArray = nb::ndarray<nb::ro, nb::device::cpu>;
+/// Argument type of every entry point that takes an array. It accepts any Python object; what it is is checked by the
+/// functions below, which know the argument's name.
+struct AnyArray {
+  nb::object object;
+};
 
 /// A length that `expect_*` accepts whatever it is.
 constexpr std::int64_t kAnyLength = -1;
@@ -32,6 +35,9 @@ struct View {
   /// Number of values.
   std::int64_t size() const;
 };
+
+/// Number of axes. Raises TypeError "name: expected a numeric NumPy array, got list" for anything else.
+std::size_t num_axes(const AnyArray& array, const char* name);
 
 /// Check dtype float64, C-contiguity, shape (kAnyLength leaves an axis open) and, if asked, that all is finite.
 /// Raises ValueError "name: expected float64 (N, 2) C-contiguous, got float32 (5, 2)".
@@ -79,3 +85,16 @@ class NewArray {
 };
 
 }  // namespace uni4d_fg
+
+namespace nanobind::detail {
+
+template <>
+struct type_caster<uni4d_fg::AnyArray> {
+  NB_TYPE_CASTER(uni4d_fg::AnyArray, const_name("numpy.typing.NDArray"))
+  bool from_python(handle source, uint8_t, cleanup_list*) noexcept {
+    value.object = borrow(source);
+    return true;
+  }
+};
+
+}  // namespace nanobind::detail

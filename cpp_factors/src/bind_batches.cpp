@@ -1,7 +1,199 @@
+// Python entry points of the batch kernels: <family>_residual, <family>_linearize, whiten and robust_energy.
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <memory>
+#include <tuple>
+
 #include "arrays.hpp"
+#include "batches.hpp"
+#include "uni4d_fg/parallel.hpp"
 
 namespace uni4d_fg {
 
-void bind_batches(nb::module_&) {}
+namespace {
+
+constexpr int kGrain = 2000;
+
+/// Check the arguments of a family, run a kernel over them and return the residual and, if asked, the Jacobians.
+std::pair<nb::object, nb::list> run(const BatchFamily& family, const std::vector<AnyArray>& values, bool linearize,
+                                    int threads) {
+  const double* in[kMaxArguments] = {};
+  std::int64_t rows = kAnyLength;
+  for (int i = 0; i < family.num_arguments; ++i) {
+    const Argument& argument = family.arguments[i];
+    const AnyArray& array = values[static_cast<std::size_t>(i)];
+    View<double> view;
+    if (argument.columns == 16)
+      view = expect_floats(array, argument.name, {rows, 4, 4});
+    else if (argument.scalar)
+      view = expect_floats(array, argument.name, {rows});
+    else
+      view = expect_floats(array, argument.name, {rows, argument.columns});
+    if (argument.positive) expect_positive(view, argument.name);
+    rows = view.rows();
+    in[i] = view.data;
+  }
+  const int count = expect_count(rows, family.arguments[0].name);
+  const int workers = useful_threads(expect_threads(threads), count, kGrain);
+  const auto n = static_cast<std::size_t>(count), dim = static_cast<std::size_t>(family.dim);
+  std::vector<NewArray> results;
+  results.emplace_back(std::vector<std::size_t>{n, dim});
+  for (int i = 0; linearize && i < family.num_variables; ++i)
+    results.emplace_back(std::vector<std::size_t>{n, dim, static_cast<std::size_t>(family.arguments[i].tangent)});
+  double* out[kMaxArguments + 1] = {};
+  for (std::size_t i = 0; i < results.size(); ++i) out[i] = results[i].data();
+  {
+    nb::gil_scoped_release release;
+    const BatchKernel kernel = linearize ? family.linearize : family.residual;
+    parallel_for(count, workers, [&](int begin, int end, int) { kernel(in, out, begin, end); });
+  }
+  nb::list jacobians;
+  for (std::size_t i = 1; i < results.size(); ++i) jacobians.append(nb::cast(results[i].release()));
+  return {nb::cast(results[0].release()), jacobians};
+}
+
+template <std::size_t>
+using Array = AnyArray;
+
+template <std::size_t... V, std::size_t... D>
+void bind_family(nb::module_& module, const BatchFamily& family, std::index_sequence<V...>, std::index_sequence<D...>) {
+  const BatchFamily* f = &family;
+  constexpr std::size_t variables = sizeof...(V);
+  const std::string name = family.name;
+  const std::string text = "Batch of the family '" + name + "'; arrays as in uni4d_fg.factors, float64, C-contiguous.";
+  module.def(
+      (name + "_residual").c_str(),
+      [f](Array<V>... variable, Array<D>... data, int threads) {
+        return run(*f, {variable..., data...}, false, threads).first;
+      },
+      nb::arg(family.arguments[V].name)..., nb::kw_only(), nb::arg(family.arguments[variables + D].name)...,
+      nb::arg("threads") = 0, (text + " Returns the residuals (N, d).").c_str());
+  module.def(
+      (name + "_linearize").c_str(),
+      [f](Array<V>... variable, Array<D>... data, int threads) {
+        auto [residual, jacobians] = run(*f, {variable..., data...}, true, threads);
+        return nb::make_tuple(residual, jacobians);
+      },
+      nb::arg(family.arguments[V].name)..., nb::kw_only(), nb::arg(family.arguments[variables + D].name)...,
+      nb::arg("threads") = 0, (text + " Returns the residuals (N, d) and the Jacobians (N, d, dim).").c_str());
+}
+
+template <std::size_t variables, std::size_t arguments>
+void bind_if(nb::module_& module, const BatchFamily& family) {
+  if (family.num_variables == static_cast<int>(variables) && family.num_arguments == static_cast<int>(arguments))
+    bind_family(module, family, std::make_index_sequence<variables>(),
+                std::make_index_sequence<arguments - variables>());
+}
+
+/// Noise, weight and kernel of a batch, checked.
+struct Noise {
+  Sigma sigma;
+  View<double> weight;
+  Kernel kernel;
+};
+
+Noise expect_noise(const AnyArray& sigma, const AnyArray& weight, int kernel, double threshold, std::int64_t rows,
+                   int dim) {
+  return {expect_sigma(sigma, "sigma", rows, dim), expect_weights(weight, "weight", rows),
+          expect_kernel(kernel, threshold)};
+}
+
+/// Whiten one residual row into `out` and return its squared norm.
+double whiten_row(const double* r, const Noise& noise, long n, int dim, double* inverse_sigma, double* out) {
+  double squared = 0.0;
+  for (int i = 0; i < dim; ++i) {
+    inverse_sigma[i] = 1.0 / noise.sigma.view.data[noise.sigma.columns == 1 ? n : n * dim + i];
+    out[i] = r[i] * inverse_sigma[i];
+    squared += out[i] * out[i];
+  }
+  return squared;
+}
+
+nb::tuple whiten_batch(const AnyArray& residual, const std::vector<AnyArray>& jacobians, const AnyArray& sigma,
+                 const AnyArray& weight, int kernel, double threshold, int threads) {
+  const View<double> r = expect_floats(residual, "residual", {kAnyLength, kAnyLength});
+  const int count = expect_count(r.rows(), "residual");
+  const int dim = static_cast<int>(r.shape[1]);
+  if (dim < 1 || dim > 16) refuse("residual: expected 1 to 16 columns, got " + std::to_string(dim));
+  const Noise noise = expect_noise(sigma, weight, kernel, threshold, r.rows(), dim);
+  const int workers = useful_threads(expect_threads(threads), count, kGrain);
+  std::vector<View<double>> blocks;
+  std::vector<NewArray> results;
+  const auto n = static_cast<std::size_t>(count), d = static_cast<std::size_t>(dim);
+  results.emplace_back(std::vector<std::size_t>{n, d});
+  for (const AnyArray& jacobian : jacobians) {
+    blocks.push_back(expect_floats(jacobian, "jacobians", {r.rows(), dim, kAnyLength}));
+    results.emplace_back(std::vector<std::size_t>{n, d, static_cast<std::size_t>(blocks.back().shape[2])});
+  }
+  {
+    nb::gil_scoped_release release;
+    parallel_for(count, workers, [&](int begin, int end, int) {
+      double inverse_sigma[16];
+      for (long row = begin; row < end; ++row) {
+        double* out = results[0].data() + row * dim;
+        const double squared = whiten_row(r.data + row * dim, noise, row, dim, inverse_sigma, out);
+        const double scale = irls_scale(noise.kernel, noise.weight.data[row], squared);
+        for (int i = 0; i < dim; ++i) out[i] *= scale;
+        for (std::size_t b = 0; b < blocks.size(); ++b) {
+          const long width = blocks[b].shape[2];
+          for (int i = 0; i < dim; ++i) {
+            const double* from = blocks[b].data + (row * dim + i) * width;
+            double* to = results[b + 1].data() + (row * dim + i) * width;
+            for (long j = 0; j < width; ++j) to[j] = from[j] * (inverse_sigma[i] * scale);
+          }
+        }
+      }
+    });
+  }
+  nb::list scaled;
+  for (std::size_t b = 1; b < results.size(); ++b) scaled.append(nb::cast(results[b].release()));
+  return nb::make_tuple(nb::cast(results[0].release()), scaled);
+}
+
+double robust_energy(const AnyArray& residual, const AnyArray& sigma, const AnyArray& weight, int kernel,
+                     double threshold, int threads) {
+  const View<double> r = expect_floats(residual, "residual", {kAnyLength, kAnyLength});
+  const int count = expect_count(r.rows(), "residual");
+  const int dim = static_cast<int>(r.shape[1]);
+  if (dim < 1 || dim > 16) refuse("residual: expected 1 to 16 columns, got " + std::to_string(dim));
+  const Noise noise = expect_noise(sigma, weight, kernel, threshold, r.rows(), dim);
+  const int workers = useful_threads(expect_threads(threads), count, kGrain);
+  std::vector<double> partial(static_cast<std::size_t>(workers), 0.0);
+  {
+    nb::gil_scoped_release release;
+    parallel_for(count, workers, [&](int begin, int end, int worker) {
+      double inverse_sigma[16], white[16], sum = 0.0;
+      for (long row = begin; row < end; ++row)
+        sum += noise.weight.data[row] *
+               rho(noise.kernel, whiten_row(r.data + row * dim, noise, row, dim, inverse_sigma, white));
+      partial[static_cast<std::size_t>(worker)] = sum;
+    });
+  }
+  double total = 0.0;
+  for (const double sum : partial) total += sum;
+  return total;
+}
+
+}  // namespace
+
+void bind_batches(nb::module_& module) {
+  for (int i = 0; i < kNumFamilies; ++i) {
+    const BatchFamily& family = kFamilies[i];
+    bind_if<1, 4>(module, family);
+    bind_if<2, 2>(module, family);
+    bind_if<3, 3>(module, family);
+    bind_if<3, 4>(module, family);
+    bind_if<3, 6>(module, family);
+    bind_if<4, 4>(module, family);
+  }
+  module.def("whiten", &whiten_batch, nb::arg("residual"), nb::arg("jacobians"), nb::kw_only(), nb::arg("sigma"),
+             nb::arg("weight"), nb::arg("kernel"), nb::arg("threshold"), nb::arg("threads") = 0,
+             "Scale residuals (N, d) and Jacobians (N, d, dim) by 1 / sigma and by sqrt(weight w(s)), s the whitened "
+             "norm.");
+  module.def("robust_energy", &robust_energy, nb::arg("residual"), nb::kw_only(), nb::arg("sigma"), nb::arg("weight"),
+             nb::arg("kernel"), nb::arg("threshold"), nb::arg("threads") = 0,
+             "Return sum_n weight_n rho(|r_n / sigma_n|) of residuals (N, d).");
+}
 
 }  // namespace uni4d_fg
