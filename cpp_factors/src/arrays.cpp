@@ -120,6 +120,10 @@ View<double> expect_floats(const AnyArray& array, const char* name, std::initial
   return view;
 }
 
+View<std::int64_t> expect_integers(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape) {
+  return expect<std::int64_t>(array, name, shape, "int64");
+}
+
 View<std::int64_t> expect_rows(const AnyArray& array, const char* name, std::int64_t length, std::int64_t limit) {
   View<std::int64_t> view = expect<std::int64_t>(array, name, {length}, "int64");
   for (std::int64_t i = 0; i < view.rows(); ++i)

@@ -44,6 +44,9 @@ std::size_t num_axes(const AnyArray& array, const char* name);
 View<double> expect_floats(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape,
                            bool finite = true);
 
+/// Check dtype int64, C-contiguity and shape.
+View<std::int64_t> expect_integers(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape);
+
 /// Check dtype int64, C-contiguity, shape (n,) and that every entry lies in [0, limit).
 View<std::int64_t> expect_rows(const AnyArray& array, const char* name, std::int64_t length, std::int64_t limit);
 

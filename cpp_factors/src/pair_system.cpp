@@ -1,0 +1,296 @@
+#include "pair_system.hpp"
+
+#include <algorithm>
+#include <numeric>
+#include <utility>
+
+#include "uni4d_fg/camera.hpp"
+#include "uni4d_fg/parallel.hpp"
+
+namespace uni4d_fg {
+
+namespace {
+
+constexpr int kTileRows = 64;
+constexpr int kLanes = 4;
+constexpr int kRowsPerThread = 4000;
+constexpr int kColumns = PairSystem::kColumns;
+constexpr int kSums = PairSystem::kSums;
+
+/// What a tile reads.
+struct TileInput {
+  const double *u_source, *v_source, *depth, *u_target, *v_target, *inverse_sigma_u, *inverse_sigma_v, *weight;
+  int rows;
+};
+
+struct Residual {
+  double u, v;
+};
+
+UNI4D_FG_INLINE Residual whitened_residual(const Pose& relative, const Intrinsics& k, double inverse_fx,
+                                           double inverse_fy, const TileInput& in, int n) {
+  const double depth = in.depth[n];
+  const Vec3 lifted{(in.u_source[n] - k.cx) * inverse_fx * depth, (in.v_source[n] - k.cy) * inverse_fy * depth, depth};
+  const Pixel pixel = project(k, camera_to_world(relative, lifted));
+  return {(in.u_target[n] - pixel.u) * in.inverse_sigma_u[n], (in.v_target[n] - pixel.v) * in.inverse_sigma_v[n]};
+}
+
+template <KernelKind kind>
+UNI4D_FG_INLINE double tile_energy(const Pose& relative, const Intrinsics& k, double threshold, const TileInput& in) {
+  const double inverse_fx = 1.0 / k.fx, inverse_fy = 1.0 / k.fy;
+  double squared[kTileRows];
+  for (int n = 0; n < in.rows; ++n) {
+    const Residual r = whitened_residual(relative, k, inverse_fx, inverse_fy, in, n);
+    squared[n] = r.u * r.u + r.v * r.v;
+  }
+  double terms[kTileRows];
+  for (int n = 0; n < in.rows; ++n) terms[n] = in.weight[n] * kernel_rho<kind>(threshold, squared[n]);
+  double sum = 0.0;
+  for (int n = 0; n < in.rows; ++n) sum += terms[n];
+  return sum;
+}
+
+/// Columns of both residual rows of every factor, scaled: the u rows first, then the v rows.
+using Scratch = double[kColumns][2 * kTileRows];
+
+template <KernelKind kind>
+UNI4D_FG_INLINE void tile_columns(const Pose& relative, const Intrinsics& k, double threshold, const TileInput& in,
+                                  Scratch& a) {
+  const Mat3& rotation = relative.rotation;
+  const double inverse_fx = 1.0 / k.fx, inverse_fy = 1.0 / k.fy;
+  for (int n = 0; n < in.rows; ++n) {
+    const double depth = in.depth[n];
+    const Vec3 lifted{(in.u_source[n] - k.cx) * inverse_fx * depth, (in.v_source[n] - k.cy) * inverse_fy * depth,
+                      depth};
+    const Vec3 x = camera_to_world(relative, lifted);
+    const Projection p = project_linearized(k, x);
+    double r_u = (in.u_target[n] - p.u) * in.inverse_sigma_u[n], r_v = (in.v_target[n] - p.v) * in.inverse_sigma_v[n];
+    const double scale = std::sqrt(in.weight[n] * kernel_weight<kind>(threshold, r_u * r_u + r_v * r_v));
+    const double s_u = in.inverse_sigma_u[n] * scale, s_v = in.inverse_sigma_v[n] * scale;
+    const double u_x = p.u_x * s_u, u_z = p.u_z * s_u, v_y = p.v_y * s_v, v_z = p.v_z * s_v;
+    const double u_0 = u_x * rotation(0, 0) + u_z * rotation(2, 0), u_1 = u_x * rotation(0, 1) + u_z * rotation(2, 1);
+    const double v_0 = v_y * rotation(1, 0) + v_z * rotation(2, 0), v_1 = v_y * rotation(1, 1) + v_z * rotation(2, 1);
+    const double x_fx = lifted.x * inverse_fx, y_fy = lifted.y * inverse_fy;
+    const double d_fx = depth * inverse_fx, d_fy = depth * inverse_fy;
+    const int m = kTileRows + n;
+    a[0][n] = u_z * x.y;
+    a[1][n] = u_x * x.z - u_z * x.x;
+    a[2][n] = -u_x * x.y;
+    a[3][n] = u_x;
+    a[4][n] = 0.0;
+    a[5][n] = u_z;
+    a[6][n] = u_0 * x_fx - p.u_fx * s_u;
+    a[7][n] = u_1 * y_fy;
+    a[8][n] = u_0 * d_fx - s_u;
+    a[9][n] = u_1 * d_fy;
+    a[10][n] = r_u * scale;
+    a[0][m] = v_z * x.y - v_y * x.z;
+    a[1][m] = -v_z * x.x;
+    a[2][m] = v_y * x.x;
+    a[3][m] = 0.0;
+    a[4][m] = v_y;
+    a[5][m] = v_z;
+    a[6][m] = v_0 * x_fx;
+    a[7][m] = v_1 * y_fy - p.v_fy * s_v;
+    a[8][m] = v_0 * d_fx;
+    a[9][m] = v_1 * d_fy - s_v;
+    a[10][m] = r_v * scale;
+  }
+}
+
+/// Add the products of one column with the `count` columns from `first` on, summed over the rows of a tile.
+template <int count>
+UNI4D_FG_INLINE void add_products(const Scratch& a, int column, int first, int rows, double* sums) {
+  double lanes[count][kLanes] = {};
+  for (int half = 0; half < 2; ++half)
+    for (int n = half * kTileRows; n < half * kTileRows + rows; n += kLanes)
+      for (int j = 0; j < count; ++j)
+        for (int lane = 0; lane < kLanes; ++lane) lanes[j][lane] += a[column][n + lane] * a[first + j][n + lane];
+  for (int j = 0; j < count; ++j) sums[j] += (lanes[j][0] + lanes[j][1]) + (lanes[j][2] + lanes[j][3]);
+}
+
+/// Add the Gram matrix of the columns, upper triangle by rows.
+template <int column>
+UNI4D_FG_INLINE void add_gram(const Scratch& a, int rows, double* sums) {
+  add_products<kColumns - column>(a, column, column, rows, sums);
+  if constexpr (column + 1 < kColumns) add_gram<column + 1>(a, rows, sums + kColumns - column);
+}
+
+template <KernelKind kind>
+UNI4D_FG_INLINE void tile_sums(const Pose& relative, const Intrinsics& k, double threshold, const TileInput& in,
+                               double* sums) {
+  alignas(64) Scratch a;
+  tile_columns<kind>(relative, k, threshold, in, a);
+  const int padded = (in.rows + kLanes - 1) / kLanes * kLanes;
+  for (int n = in.rows; n < padded; ++n)
+    for (int j = 0; j < kColumns; ++j) a[j][n] = a[j][kTileRows + n] = 0.0;
+  add_gram<0>(a, padded, sums);
+}
+
+UNI4D_FG_CLONES double energy_of_tile(const Pose& relative, const Intrinsics& k, const Kernel& kernel,
+                                      const TileInput& in) {
+  const double c = kernel.threshold;
+  switch (kernel.kind) {
+    case KernelKind::huber: return tile_energy<KernelKind::huber>(relative, k, c, in);
+    case KernelKind::pseudo_huber: return tile_energy<KernelKind::pseudo_huber>(relative, k, c, in);
+    case KernelKind::cauchy: return tile_energy<KernelKind::cauchy>(relative, k, c, in);
+    case KernelKind::norm: return tile_energy<KernelKind::norm>(relative, k, c, in);
+    default: return tile_energy<KernelKind::quadratic>(relative, k, c, in);
+  }
+}
+
+UNI4D_FG_CLONES void sums_of_tile(const Pose& relative, const Intrinsics& k, const Kernel& kernel, const TileInput& in,
+                                  double* sums) {
+  const double c = kernel.threshold;
+  switch (kernel.kind) {
+    case KernelKind::huber: return tile_sums<KernelKind::huber>(relative, k, c, in, sums);
+    case KernelKind::pseudo_huber: return tile_sums<KernelKind::pseudo_huber>(relative, k, c, in, sums);
+    case KernelKind::cauchy: return tile_sums<KernelKind::cauchy>(relative, k, c, in, sums);
+    case KernelKind::norm: return tile_sums<KernelKind::norm>(relative, k, c, in, sums);
+    default: return tile_sums<KernelKind::quadratic>(relative, k, c, in, sums);
+  }
+}
+
+}  // namespace
+
+PairSystem::PairSystem(int num_poses, const PairRows& rows, const Kernel& kernel,
+                       std::vector<std::int64_t> pose_columns, std::vector<std::int64_t> intrinsics_columns, int size,
+                       int threads)
+    : num_poses_(num_poses),
+      size_(size),
+      threads_(threads),
+      kernel_(kernel),
+      pose_columns_(std::move(pose_columns)),
+      intrinsics_columns_(std::move(intrinsics_columns)) {
+  const auto count = static_cast<std::size_t>(rows.count);
+  std::vector<std::size_t> order(count);
+  std::iota(order.begin(), order.end(), std::size_t{0});
+  const auto before = [&](std::size_t a, std::size_t b) {
+    return std::pair(rows.source[a], rows.target[a]) < std::pair(rows.source[b], rows.target[b]);
+  };
+  if (!std::is_sorted(order.begin(), order.end(), before)) std::stable_sort(order.begin(), order.end(), before);
+  for (std::vector<double>* array : {&u_source_, &v_source_, &depth_, &u_target_, &v_target_, &inverse_sigma_u_,
+                                     &inverse_sigma_v_, &weight_})
+    array->resize(count);
+  for (std::size_t i = 0; i < count; ++i) {
+    const std::size_t n = order[i];
+    u_source_[i] = rows.uv_source[2 * n];
+    v_source_[i] = rows.uv_source[2 * n + 1];
+    depth_[i] = rows.depth[n];
+    u_target_[i] = rows.uv_target[2 * n];
+    v_target_[i] = rows.uv_target[2 * n + 1];
+    const std::size_t columns = static_cast<std::size_t>(rows.sigma_columns);
+    inverse_sigma_u_[i] = 1.0 / rows.sigma[columns * n];
+    inverse_sigma_v_[i] = 1.0 / rows.sigma[columns * n + columns - 1];
+    weight_[i] = rows.weight[n];
+    const Pair pair{static_cast<int>(rows.source[n]), static_cast<int>(rows.target[n])};
+    const int row = static_cast<int>(i);
+    const bool new_pair = pairs_.empty() || pairs_.back().source != pair.source || pairs_.back().target != pair.target;
+    if (new_pair) pairs_.push_back(pair);
+    if (new_pair || row - tiles_.back().begin == kTileRows)
+      tiles_.push_back({static_cast<int>(pairs_.size()) - 1, row, row});
+    tiles_.back().end = row + 1;
+  }
+}
+
+std::vector<Pose> PairSystem::relative_poses(const double* poses) const {
+  std::vector<Pose> relative;
+  relative.reserve(pairs_.size());
+  for (const Pair& pair : pairs_)
+    relative.push_back(relative_pose(load_pose(poses + 16 * pair.target), load_pose(poses + 16 * pair.source)));
+  return relative;
+}
+
+int PairSystem::workers() const {
+  return useful_threads(threads_, static_cast<int>(weight_.size()), kRowsPerThread);
+}
+
+double PairSystem::energy(const double* poses, const double* intrinsics) const {
+  const Intrinsics k = load_intrinsics(intrinsics);
+  const std::vector<Pose> relative = relative_poses(poses);
+  const int threads = workers();
+  std::vector<double> partial(static_cast<std::size_t>(threads), 0.0);
+  parallel_for(static_cast<int>(tiles_.size()), threads, [&](int begin, int end, int worker) {
+    double sum = 0.0;
+    for (int i = begin; i < end; ++i) {
+      const Tile& tile = tiles_[static_cast<std::size_t>(i)];
+      const auto at = static_cast<std::size_t>(tile.begin);
+      const TileInput in{&u_source_[at],        &v_source_[at],        &depth_[at],  &u_target_[at], &v_target_[at],
+                         &inverse_sigma_u_[at], &inverse_sigma_v_[at], &weight_[at], tile.end - tile.begin};
+      sum += energy_of_tile(relative[static_cast<std::size_t>(tile.pair)], k, kernel_, in);
+    }
+    partial[static_cast<std::size_t>(worker)] = sum;
+  });
+  return std::accumulate(partial.begin(), partial.end(), 0.0);
+}
+
+void PairSystem::linearize(const double* poses, const double* intrinsics, double* hessian, double* gradient) const {
+  const Intrinsics k = load_intrinsics(intrinsics);
+  const std::vector<Pose> relative = relative_poses(poses);
+  const int threads = workers();
+  const std::size_t width = pairs_.size() * kSums;
+  std::vector<double> partial(width * static_cast<std::size_t>(threads), 0.0);
+  parallel_for(static_cast<int>(tiles_.size()), threads, [&](int begin, int end, int worker) {
+    double* sums = partial.data() + width * static_cast<std::size_t>(worker);
+    for (int i = begin; i < end; ++i) {
+      const Tile& tile = tiles_[static_cast<std::size_t>(i)];
+      const auto at = static_cast<std::size_t>(tile.begin);
+      const TileInput in{&u_source_[at],        &v_source_[at],        &depth_[at],  &u_target_[at], &v_target_[at],
+                         &inverse_sigma_u_[at], &inverse_sigma_v_[at], &weight_[at], tile.end - tile.begin};
+      sums_of_tile(relative[static_cast<std::size_t>(tile.pair)], k, kernel_, in, sums + kSums * tile.pair);
+    }
+  });
+  for (int worker = 1; worker < threads; ++worker)
+    for (std::size_t i = 0; i < width; ++i) partial[i] += partial[width * static_cast<std::size_t>(worker) + i];
+  std::fill(hessian, hessian + static_cast<std::size_t>(size_) * static_cast<std::size_t>(size_), 0.0);
+  std::fill(gradient, gradient + size_, 0.0);
+  for (std::size_t i = 0; i < pairs_.size(); ++i) spread(pairs_[i], relative[i], &partial[kSums * i], hessian, gradient);
+}
+
+void PairSystem::spread(const Pair& pair, const Pose& target_T_source, const double* sums, double* hessian,
+                        double* gradient) const {
+  // (target twist, intrinsics, residual) in full, then twist of the source = -Ad^T twist of the target.
+  double full[kColumns][kColumns];
+  for (int i = 0, at = 0; i < kColumns; ++i)
+    for (int j = i; j < kColumns; ++j, ++at) full[i][j] = full[j][i] = sums[at];
+  double adjoint[6][6] = {};
+  const Mat3 lower = skew(target_T_source.center) * target_T_source.rotation;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      adjoint[i][j] = adjoint[3 + i][3 + j] = target_T_source.rotation(i, j);
+      adjoint[3 + i][j] = lower(i, j);
+    }
+  // Rows of `moved`: the source twist times every column of `full`.
+  double moved[6][kColumns], source_source[6][6];
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < kColumns; ++j) {
+      double sum = 0.0;
+      for (int m = 0; m < 6; ++m) sum -= adjoint[m][i] * full[m][j];
+      moved[i][j] = sum;
+    }
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) {
+      double sum = 0.0;
+      for (int m = 0; m < 6; ++m) sum -= moved[i][m] * adjoint[m][j];
+      source_source[i][j] = sum;
+    }
+  // Order of the pair's sixteen entries: source twist, target twist, intrinsics.
+  std::int64_t columns[16];
+  for (int i = 0; i < 6; ++i) {
+    columns[i] = pose_columns_[static_cast<std::size_t>(6 * pair.source + i)];
+    columns[6 + i] = pose_columns_[static_cast<std::size_t>(6 * pair.target + i)];
+  }
+  for (int i = 0; i < 4; ++i) columns[12 + i] = intrinsics_columns_[static_cast<std::size_t>(i)];
+  const auto entry = [&](int i, int j) {
+    if (i < 6) return j < 6 ? source_source[i][j] : moved[i][j - 6];
+    return j < 6 ? moved[j][i - 6] : full[i - 6][j - 6];
+  };
+  for (int i = 0; i < 16; ++i) {
+    if (columns[i] < 0) continue;
+    gradient[columns[i]] += i < 6 ? moved[i][kColumns - 1] : full[i - 6][kColumns - 1];
+    for (int j = 0; j < 16; ++j)
+      if (columns[j] >= 0) hessian[columns[i] * size_ + columns[j]] += entry(i, j);
+  }
+}
+
+}  // namespace uni4d_fg
