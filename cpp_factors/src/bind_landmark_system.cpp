@@ -1,7 +1,213 @@
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <limits>
+#include <memory>
+#include <tuple>
+
 #include "arrays.hpp"
+#include "uni4d_fg/landmark_system.hpp"
 
 namespace uni4d_fg {
 
-void bind_landmark_system(nb::module_&) {}
+namespace {
+
+/// pose, landmark, measured, sigma, weight, kernel code, threshold.
+using BatchArguments = std::tuple<AnyArray, AnyArray, AnyArray, AnyArray, AnyArray, int, double>;
+
+LandmarkBatch read_batch(const BatchArguments& arguments, const LandmarkProblem& problem, bool depth) {
+  const auto& [pose, landmark, measured, sigma, weight, kernel, threshold] = arguments;
+  LandmarkBatch batch;
+  const auto pose_view = expect_rows(pose, "pose", kAnyLength, problem.num_frames);
+  batch.count = pose_view.rows();
+  batch.pose = pose_view.data;
+  batch.landmark = expect_rows(landmark, "landmark", batch.count, problem.num_landmarks).data;
+  // What is measured may be NaN or infinite: the linearisation reports it.
+  batch.measured = depth ? expect_floats(measured, "depth", {batch.count}, false).data
+                         : expect_floats(measured, "uv", {batch.count, 2}, false).data;
+  const Sigma checked = expect_sigma(sigma, "sigma", batch.count, depth ? 1 : 2);
+  batch.sigma = checked.view.data;
+  batch.sigma_columns = checked.columns;
+  batch.weight = expect_weights(weight, "weight", batch.count).data;
+  batch.kernel = expect_kernel(kernel, threshold);
+  return batch;
+}
+
+/// Check that the columns that are not -1 count up from 0.
+void read_columns(const AnyArray& array, LandmarkProblem& problem) {
+  const auto view = expect_integers(array, "columns", {problem.num_frames, kFrameColumns});
+  const std::int64_t* data = view.data;
+  const auto size = static_cast<std::size_t>(view.size());
+  for (std::size_t i = 0; i < size; ++i) {
+    if (data[i] != -1 && data[i] != problem.num_columns)
+      refuse("columns: entry " + std::to_string(i) + " (flat index) is " + std::to_string(data[i]) + ", not -1 or " +
+             std::to_string(problem.num_columns));
+    problem.columns.push_back(static_cast<int>(data[i]));
+    if (data[i] != -1) problem.num_columns += 1;
+  }
+}
+
+class BoundLandmarkSystem {
+ public:
+  BoundLandmarkSystem(const std::vector<BatchArguments>& reprojection, const std::vector<BatchArguments>& depth,
+                      std::int64_t num_frames, const AnyArray& landmark_free, const AnyArray& columns,
+                      bool intrinsics_free, std::int64_t stored_rows, bool banded, int threads) {
+    const int workers = expect_threads(threads);
+    LandmarkProblem problem;
+    if (num_frames < 0 || num_frames >= (std::int64_t{1} << 25))
+      refuse("num_frames: expected a number in [0, 2^25), got " + std::to_string(num_frames));
+    problem.num_frames = static_cast<int>(num_frames);
+    const auto free = expect_rows(landmark_free, "landmark_free", kAnyLength, 2);
+    problem.num_landmarks = expect_count(free.rows(), "landmark_free");
+    problem.landmark_free.assign(free.data, free.data + free.rows());
+    std::int64_t total = 0;
+    for (const BatchArguments& arguments : reprojection) {
+      problem.reprojection.push_back(read_batch(arguments, problem, false));
+      total += problem.reprojection.back().count;
+    }
+    for (const BatchArguments& arguments : depth) {
+      problem.depth.push_back(read_batch(arguments, problem, true));
+      total += problem.depth.back().count;
+    }
+    expect_count(total, "factors");
+    read_columns(columns, problem);
+    problem.intrinsics_free = intrinsics_free;
+    const int least = banded ? std::min(1, problem.num_columns) : problem.num_columns;
+    if (stored_rows < least || stored_rows > problem.num_columns)
+      refuse("stored_rows: expected a number in [" + std::to_string(least) + ", " +
+             std::to_string(problem.num_columns) + "], got " + std::to_string(stored_rows));
+    problem.stored_rows = static_cast<int>(stored_rows);
+    problem.banded = banded;
+    nb::gil_scoped_release release;
+    system_ = std::make_unique<LandmarkSystem>(std::move(problem), workers);
+  }
+
+  nb::object energies(const AnyArray& world_T_cam, const AnyArray& intrinsics, const AnyArray& log_scale,
+                      const AnyArray& landmarks) const {
+    const LandmarkState state = read_state(world_T_cam, intrinsics, log_scale, landmarks);
+    NewArray out({static_cast<std::size_t>(system_->num_batches())});
+    {
+      nb::gil_scoped_release release;
+      system_->energies(state, out.data());
+    }
+    return nb::cast(out.release());
+  }
+
+  nb::tuple linearize(const AnyArray& world_T_cam, const AnyArray& intrinsics, const AnyArray& log_scale,
+                      const AnyArray& landmarks) {
+    const LandmarkState state = read_state(world_T_cam, intrinsics, log_scale, landmarks);
+    NewSystem out(system_->problem());
+    LinearizeResult result;
+    {
+      nb::gil_scoped_release release;
+      result = system_->linearize(state, out.view());
+    }
+    return nb::make_tuple(out.core.release(), out.border.release(), out.corner.release(), out.gradient.release(),
+                          result.landmark_gradient_max, result.finite);
+  }
+
+  nb::tuple landmark_blocks() const {
+    expect_linearized();
+    const auto count = static_cast<std::size_t>(system_->problem().num_landmarks);
+    NewArray blocks({count, 3, 3}), gradients({count, 3});
+    system_->landmark_blocks(blocks.data(), gradients.data());
+    return nb::make_tuple(blocks.release(), gradients.release());
+  }
+
+  nb::object reduce(double damping, double min_diagonal, double max_diagonal, const AnyArray& core,
+                    const AnyArray& border, const AnyArray& corner, const AnyArray& gradient) {
+    expect_linearized();
+    if (!std::isfinite(damping) || damping < 0.0)
+      refuse("damping: expected a finite number that is not negative, got " + std::to_string(damping));
+    if (!(min_diagonal >= 0.0) || !(max_diagonal >= min_diagonal))
+      refuse("min_diagonal, max_diagonal: expected 0 <= min <= max, got " + std::to_string(min_diagonal) + " and " +
+             std::to_string(max_diagonal));
+    const LandmarkProblem& problem = system_->problem();
+    const std::int64_t size = problem.num_columns;
+    // Read only, although the type that input and output share says otherwise.
+    auto read = [](const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape) {
+      return const_cast<double*>(expect_floats(array, name, shape, false).data);
+    };
+    const CameraSystem hessian{read(core, "core", {size, problem.stored_rows}), read(border, "border", {size, kBorder}),
+                               read(corner, "corner", {kBorder, kBorder}),
+                               read(gradient, "gradient", {size + kBorder})};
+    NewSystem out(problem);
+    bool positive = false;
+    {
+      nb::gil_scoped_release release;
+      positive = system_->reduce({damping, min_diagonal, max_diagonal}, hessian, out.view());
+    }
+    if (!positive) return nb::none();
+    return nb::make_tuple(out.core.release(), out.border.release(), out.corner.release(), out.gradient.release());
+  }
+
+  nb::tuple back_substitute(const AnyArray& camera_step) const {
+    if (!system_->reduced()) refuse("back_substitute: call reduce first");
+    const LandmarkProblem& problem = system_->problem();
+    const auto step = expect_floats(camera_step, "camera_step", {problem.num_columns + kBorder}, false);
+    NewArray out({static_cast<std::size_t>(problem.num_landmarks), 3});
+    StepSums sums;
+    {
+      nb::gil_scoped_release release;
+      sums = system_->back_substitute(step.data, out.data());
+    }
+    return nb::make_tuple(out.release(), sums.slope, sums.damped, sums.squared);
+  }
+
+  std::int64_t num_pairs() const { return system_->num_pairs(); }
+
+ private:
+  struct NewSystem {
+    NewArray core, border, corner, gradient;
+    explicit NewSystem(const LandmarkProblem& problem)
+        : core({static_cast<std::size_t>(problem.num_columns), static_cast<std::size_t>(problem.stored_rows)}),
+          border({static_cast<std::size_t>(problem.num_columns), kBorder}),
+          corner({kBorder, kBorder}),
+          gradient({static_cast<std::size_t>(problem.num_columns) + kBorder}) {}
+    CameraSystem view() { return {core.data(), border.data(), corner.data(), gradient.data()}; }
+  };
+
+  LandmarkState read_state(const AnyArray& world_T_cam, const AnyArray& intrinsics, const AnyArray& log_scale,
+                           const AnyArray& landmarks) const {
+    const LandmarkProblem& problem = system_->problem();
+    // A state that is not finite has an energy that is not finite: the solver decides, not the boundary.
+    return {expect_floats(world_T_cam, "world_T_cam", {problem.num_frames, 4, 4}, false).data,
+            expect_floats(intrinsics, "intrinsics", {4}, false).data,
+            expect_floats(log_scale, "log_scale", {problem.num_frames}, false).data,
+            expect_floats(landmarks, "landmarks", {problem.num_landmarks, 3}, false).data};
+  }
+
+  void expect_linearized() const {
+    if (!system_->linearized()) refuse("call linearize first");
+  }
+
+  std::unique_ptr<LandmarkSystem> system_;
+};
+
+}  // namespace
+
+void bind_landmark_system(nb::module_& module) {
+  nb::class_<BoundLandmarkSystem>(module, "LandmarkSystem",
+                                  "The landmark Schur complement of bundle adjustment. Not to be shared by threads.")
+      .def(nb::init<const std::vector<BatchArguments>&, const std::vector<BatchArguments>&, std::int64_t,
+                    const AnyArray&, const AnyArray&, bool, std::int64_t, bool, int>(),
+           nb::arg("reprojection"), nb::arg("depth"), nb::arg("num_frames"), nb::arg("landmark_free"),
+           nb::arg("columns"), nb::arg("intrinsics_free"), nb::arg("stored_rows"), nb::arg("banded"),
+           nb::arg("threads") = 0,
+           "Plan the factors: batches are (pose, landmark, uv or depth, sigma, weight, kernel code, threshold).")
+      .def("energies", &BoundLandmarkSystem::energies, nb::arg("world_T_cam"), nb::arg("intrinsics"),
+           nb::arg("log_scale"), nb::arg("landmarks"), "Energy per batch, reprojection batches first.")
+      .def("linearize", &BoundLandmarkSystem::linearize, nb::arg("world_T_cam"), nb::arg("intrinsics"),
+           nb::arg("log_scale"), nb::arg("landmarks"),
+           "Return core, border, corner, gradient, largest landmark gradient, and whether all is finite.")
+      .def("landmark_blocks", &BoundLandmarkSystem::landmark_blocks,
+           "Return the landmarks' Hessian blocks (N, 3, 3) and gradients (N, 3) of the last linearisation.")
+      .def("reduce", &BoundLandmarkSystem::reduce, nb::arg("damping"), nb::arg("min_diagonal"),
+           nb::arg("max_diagonal"), nb::arg("core"), nb::arg("border"), nb::arg("corner"), nb::arg("gradient"),
+           "Return the reduced core, border, corner and right-hand side, or None if a landmark is not determined.")
+      .def("back_substitute", &BoundLandmarkSystem::back_substitute, nb::arg("camera_step"),
+           "Return the landmarks' step (N, 3) and its sums slope, damped and squared.")
+      .def_prop_ro("num_pairs", &BoundLandmarkSystem::num_pairs, "Observations of free landmarks.");
+}
 
 }  // namespace uni4d_fg

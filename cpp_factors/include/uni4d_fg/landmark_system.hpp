@@ -1,0 +1,115 @@
+// The landmark Schur complement of bundle adjustment: linearise, eliminate the landmarks, back-substitute.
+//
+//     [ H_cc  E ] [d_c]     [g_c]
+//     [ E^T   V ] [d_l] = - [g_l]        S = H_cc - E V^{-1} E^T,  V block-diagonal with 3x3 blocks
+//
+// The camera system has the free entries of (pose, log-scale) frame by frame, its core, bordered by the four
+// intrinsics. The core is stored like LAPACK's lower triangle: entry (i, j), i >= j, of a dense core stands at
+// j * rows + i, of a banded one at j * rows + (i - j). The source of the algorithm is Triggs et al. 2000, "Bundle
+// adjustment - a modern synthesis"; damping is Marquardt's, on the clamped diagonal, before the elimination.
+#pragma once
+
+#include <vector>
+
+#include "uni4d_fg/landmark_plan.hpp"
+
+namespace uni4d_fg {
+
+/// Values of the variables; shapes as in the Python package.
+struct LandmarkState {
+  const double* world_T_cam;  ///< (T, 4, 4)
+  const double* intrinsics;   ///< (4,) px
+  const double* log_scale;    ///< (T,); not read without depth batches
+  const double* landmarks;    ///< (N, 3) m
+};
+
+struct DampingBounds {
+  double damping, min_diagonal, max_diagonal;
+};
+
+/// A camera system with n core columns, in storage of the caller.
+struct CameraSystem {
+  double* core;      ///< (n, stored rows)
+  double* border;    ///< (n, 4)
+  double* corner;    ///< (4, 4)
+  double* gradient;  ///< (n + 4,)
+};
+
+struct LinearizeResult {
+  double landmark_gradient_max = 0.0;  ///< over free landmarks
+  bool finite = true;
+};
+
+/// The sums over landmarks that the norm of a step and the decrease it predicts need.
+struct StepSums {
+  double slope = 0.0;    ///< g_l . d_l
+  double damped = 0.0;   ///< d_l . D_l d_l, D the clamped diagonal
+  double squared = 0.0;  ///< d_l . d_l
+};
+
+constexpr int kFrameColumns = 7;
+constexpr int kBorder = 4;
+
+class LandmarkSystem {
+ public:
+  /// Plan once; `threads` bounds the number of workers. The arrays of the batches are not read afterwards.
+  /// Throws std::invalid_argument if frames that share a landmark are further apart than the stored rows.
+  LandmarkSystem(LandmarkProblem problem, int threads);
+
+  int num_batches() const { return num_reprojection_ + num_depth_; }
+  std::int64_t num_pairs() const { return plan_.num_pairs; }
+  const LandmarkProblem& problem() const { return problem_; }
+
+  /// Energy of every batch, reprojection batches first, into `out` (num_batches,).
+  void energies(const LandmarkState& state, double* out) const;
+
+  /// Write the normal equations of the cameras (all of `system` is overwritten); keep those of the landmarks.
+  LinearizeResult linearize(const LandmarkState& state, const CameraSystem& system);
+
+  /// Landmark blocks V (N, 3, 3) and gradients (N, 3) of the last linearisation.
+  void landmark_blocks(double* blocks, double* gradients) const;
+
+  /// Eliminate the landmarks of the last linearisation.
+  ///
+  /// `hessian` is H_cc with everything that else reads the cameras; `reduced` becomes S with its gradient replaced
+  /// by the right-hand side -g_c + E V^{-1} g_l. Returns false if a damped landmark block is not positive definite.
+  bool reduce(const DampingBounds& bounds, const CameraSystem& hessian, const CameraSystem& reduced);
+
+  /// Landmark steps (N, 3), 0 for frozen ones, for a camera step (n + 4,), after a successful `reduce`.
+  StepSums back_substitute(const double* camera_step, double* landmark_step) const;
+
+  bool linearized() const { return linearized_; }
+  bool reduced() const { return reduced_; }
+
+ private:
+  void check_storage(const std::vector<int>& last_frame) const;
+  void write_camera_blocks(const CameraSystem& system) const;
+  void write_reduced(const DampingBounds& bounds, const CameraSystem& hessian, const CameraSystem& reduced) const;
+  bool eliminate_chunk(const LandmarkChunk& chunk, const DampingBounds& bounds, int worker);
+  double* core_column(const CameraSystem& system, int column) const;
+  int workers() const { return static_cast<int>(plan_.worker_begin.size()) - 1; }
+
+  LandmarkProblem problem_;
+  std::vector<Kernel> reprojection_kernels_, depth_kernels_;
+  int num_reprojection_ = 0, num_depth_ = 0;
+  LandmarkPlan plan_;
+  /// (pairs, 3, 8) rows of E^T of a pair: six pose entries, log-scale, 0.
+  AlignedDoubles coupling_;
+  /// (N, 24) per landmark: V as xx xy xz yy yz zz, gradient 3, coupling to the intrinsics (3, 4), 3 unused.
+  AlignedDoubles landmarks_;
+  /// (N, 6) Cholesky factor of the damped V: 1/l00, l10, 1/l11, l20, l21, 1/l22.
+  std::vector<double> factors_;
+  DampingBounds bounds_{0.0, 0.0, 0.0};
+  /// Per worker (T, kSums, 8): sums over the records of a frame, a lane each.
+  std::vector<AlignedDoubles> frame_sums_;
+  /// Per worker and frame: last frame that shares a landmark, and where the row's tiles begin.
+  std::vector<std::vector<int>> last_frame_;
+  std::vector<std::vector<std::int64_t>> tile_begin_;
+  /// Per worker (tiles, 7, 8): sums of E V^{-1} E^T, upper block triangle; then per frame the tile of the border.
+  std::vector<AlignedDoubles> tiles_;
+  std::vector<AlignedDoubles> scratch_;
+  std::vector<std::vector<int>> scratch_place_;
+  bool linearized_ = false, reduced_ = false;
+};
+
+}  // namespace uni4d_fg

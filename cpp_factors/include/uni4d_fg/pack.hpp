@@ -1,0 +1,122 @@
+// Eight doubles that are worked on together, one factor per lane.
+#pragma once
+
+#include <cmath>
+#include <cstddef>
+#include <cstring>
+#include <new>
+#include <vector>
+
+#include "uni4d_fg/math.hpp"
+
+// As UNI4D_FG_CLONES, with a third version for processors with 512-bit vectors: a pack is one of their registers.
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__linux__) && \
+    !defined(UNI4D_FG_NO_CLONES)
+#define UNI4D_FG_WIDE_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=haswell", "default")))
+#else
+#define UNI4D_FG_WIDE_CLONES UNI4D_FG_CLONES
+#endif
+
+// Packs are passed by value between inlined functions only: how a call would pass them does not matter.
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC diagnostic ignored "-Wpsabi"
+#endif
+
+namespace uni4d_fg {
+
+constexpr int kPackLanes = 8;
+
+#if defined(__GNUC__) || defined(__clang__)
+
+typedef double Pack __attribute__((vector_size(64)));
+
+#else
+
+struct Pack {
+  double lane[kPackLanes];
+  double& operator[](int i) { return lane[i]; }
+  double operator[](int i) const { return lane[i]; }
+};
+#define UNI4D_FG_PACK_OPERATOR(op)                                                  \
+  inline Pack operator op(const Pack& a, const Pack& b) {                           \
+    Pack out;                                                                       \
+    for (int i = 0; i < kPackLanes; ++i) out.lane[i] = a.lane[i] op b.lane[i];          \
+    return out;                                                                     \
+  }                                                                                 \
+  inline Pack operator op(double a, const Pack& b) {                                \
+    Pack out;                                                                       \
+    for (int i = 0; i < kPackLanes; ++i) out.lane[i] = a op b.lane[i];                  \
+    return out;                                                                     \
+  }                                                                                 \
+  inline Pack operator op(const Pack& a, double b) {                                \
+    Pack out;                                                                       \
+    for (int i = 0; i < kPackLanes; ++i) out.lane[i] = a.lane[i] op b;                  \
+    return out;                                                                     \
+  }
+UNI4D_FG_PACK_OPERATOR(+)
+UNI4D_FG_PACK_OPERATOR(-)
+UNI4D_FG_PACK_OPERATOR(*)
+UNI4D_FG_PACK_OPERATOR(/)
+inline Pack operator-(const Pack& a) { return -1.0 * a; }
+inline Pack& operator+=(Pack& a, const Pack& b) { return a = a + b; }
+inline Pack& operator-=(Pack& a, const Pack& b) { return a = a - b; }
+
+#endif
+
+UNI4D_FG_INLINE Pack broadcast(double value) { return Pack{} + value; }
+
+UNI4D_FG_INLINE Pack load_pack(const double* p) {
+  Pack out;
+  std::memcpy(&out, p, sizeof(Pack));
+  return out;
+}
+
+UNI4D_FG_INLINE void store_pack(const Pack& a, double* p) { std::memcpy(p, &a, sizeof(Pack)); }
+
+/// Larger of two values per lane; b where a is NaN.
+UNI4D_FG_INLINE Pack larger(const Pack& a, const Pack& b) {
+  Pack out;
+  for (int i = 0; i < kPackLanes; ++i) out[i] = a[i] > b[i] ? a[i] : b[i];
+  return out;
+}
+
+/// Smaller of a value and a bound per lane; the value where it is NaN.
+UNI4D_FG_INLINE Pack at_most(const Pack& value, const Pack& bound) {
+  Pack out;
+  for (int i = 0; i < kPackLanes; ++i) out[i] = bound[i] < value[i] ? bound[i] : value[i];
+  return out;
+}
+
+UNI4D_FG_INLINE Pack square_root(const Pack& a) {
+  Pack out;
+  for (int i = 0; i < kPackLanes; ++i) out[i] = std::sqrt(a[i]);
+  return out;
+}
+
+/// Sum of the lanes, always in the same order.
+UNI4D_FG_INLINE double sum(const Pack& a) {
+  return ((a[0] + a[1]) + (a[2] + a[3])) + ((a[4] + a[5]) + (a[6] + a[7]));
+}
+
+/// Memory aligned for packs.
+template <typename T>
+struct PackAllocator {
+  using value_type = T;
+  PackAllocator() = default;
+  template <typename U>
+  PackAllocator(const PackAllocator<U>&) {}
+  T* allocate(std::size_t n) { return static_cast<T*>(::operator new(n * sizeof(T), std::align_val_t(64))); }
+  void deallocate(T* p, std::size_t) { ::operator delete(p, std::align_val_t(64)); }
+  template <typename U>
+  bool operator==(const PackAllocator<U>&) const {
+    return true;
+  }
+  template <typename U>
+  bool operator!=(const PackAllocator<U>&) const {
+    return false;
+  }
+};
+
+using AlignedDoubles = std::vector<double, PackAllocator<double>>;
+
+}  // namespace uni4d_fg

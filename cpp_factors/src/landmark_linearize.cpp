@@ -1,0 +1,251 @@
+// Energies and normal equations: one pass over the groups, eight records at a time.
+#include <algorithm>
+#include <array>
+
+#include "landmark_frame_sums.hpp"
+#include "landmark_kernels.hpp"
+#include "landmark_passes.hpp"
+
+namespace uni4d_fg::landmark_passes {
+
+namespace {
+
+struct ChunkPoints {
+  double xyz[3 * kChunkLandmarks];
+  ChunkPoints(const LandmarkChunk& chunk, const double* landmarks) {
+    for (std::size_t i = 0; i < chunk.landmarks.size(); ++i)
+      for (std::size_t k = 0; k < 3; ++k) xyz[3 * i + k] = landmarks[3 * static_cast<std::size_t>(chunk.landmarks[i]) + k];
+  }
+};
+
+// Members of a vector are compiled for the oldest processor: the loops below see plain pointers.
+struct GroupArrays {
+  const RecordGroup* groups;
+  const double* data;
+  const std::uint8_t* lane_landmark;
+  const int* lane_pair;
+  std::size_t count;
+  explicit GroupArrays(const LandmarkChunk& chunk)
+      : groups(chunk.groups.data()),
+        data(chunk.data.data()),
+        lane_landmark(chunk.lane_landmark.data()),
+        lane_pair(chunk.lane_pair.data()),
+        count(chunk.groups.size()) {}
+};
+
+template <bool kDepth>
+UNI4D_FG_INLINE void energies(const PassInput& in, const LandmarkChunk& chunk, double* reprojection, double* depth) {
+  const ChunkPoints points(chunk, in.state.landmarks);
+  const Intrinsics k = load_intrinsics(in.state.intrinsics);
+  const GroupArrays groups(chunk);
+  for (std::size_t i = 0; i < groups.count; ++i) {
+    const RecordGroup& group = groups.groups[i];
+    const double* data = groups.data + i * kFields * kPackLanes;
+    const PackPoint p = gather_points(points.xyz, groups.lane_landmark + i * kPackLanes);
+    const PackPoint x = pack_to_camera(in.state.world_T_cam + 16 * group.frame, p);
+    const PackDepth z = pack_depth(x.z);
+    const Pack g = pack_inverse_depth(z);
+    const Pack u = (field(data, kU) - (k.fx * x.x * g + k.cx)) * field(data, kInverseSigmaU);
+    const Pack v = (field(data, kV) - (k.fy * x.y * g + k.cy)) * field(data, kInverseSigmaV);
+    const Pack rho = pack_rho(in.reprojection_kernels[group.reprojection], u * u + v * v);
+    Pack total = load_pack(reprojection + group.reprojection * kPackLanes);
+    total += field(data, kWeight) * rho;
+    store_pack(total, reprojection + group.reprojection * kPackLanes);
+    if constexpr (kDepth) {
+      const Pack r = (pack_log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) *
+                     field(data, kInverseSigmaDepth);
+      total = load_pack(depth + group.depth * kPackLanes);
+      total += field(data, kDepthWeight) * pack_rho(in.depth_kernels[group.depth], r * r);
+      store_pack(total, depth + group.depth * kPackLanes);
+    }
+  }
+}
+
+/// base + a * b, or base alone where no batch has a third row.
+template <bool kDepth>
+UNI4D_FG_INLINE Pack plus(const Pack& base, const Pack& a, const Pack& b) {
+  if constexpr (kDepth) return base + a * b;
+  (void)a, (void)b;
+  return base;
+}
+
+UNI4D_FG_INLINE void add(double* sums, int place, const Pack& value) {
+  double* at = sums + place * kPackLanes;
+  store_pack(load_pack(at) + value, at);
+}
+
+/// Hand out what eight records computed, (48, 8): the first 24 rows to their pairs, the others to their landmarks.
+UNI4D_FG_INLINE void scatter_group(const RecordGroup& group, const std::uint8_t* lane_landmark, const int* lane_pair,
+                                   const double* out, double* coupling, double* by_landmark) {
+  for (int lane = 0; lane < group.used; ++lane) {
+    double* pair = coupling + static_cast<std::size_t>(lane_pair[lane]) * kWidth;
+    double* landmark = by_landmark + static_cast<std::size_t>(lane_landmark[lane]) * kWidth;
+    const double* from = out + lane;
+    if (group.first)
+      for (int q = 0; q < kWidth; ++q) pair[q] = from[q * kPackLanes];
+    else
+      for (int q = 0; q < kWidth; ++q) pair[q] += from[q * kPackLanes];
+    for (int q = 0; q < kWidth; ++q) landmark[q] += from[(kWidth + q) * kPackLanes];
+  }
+}
+
+template <bool kDepth, bool kIntrinsics>
+UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, double* frame_sums, double* coupling,
+                               double* landmarks) {
+  using namespace frame_sums;
+  const ChunkPoints points(chunk, in.state.landmarks);
+  const Intrinsics k = load_intrinsics(in.state.intrinsics);
+  alignas(64) double by_landmark[kChunkLandmarks * kWidth] = {};
+  alignas(64) double out[2 * kWidth * kPackLanes] = {};
+  const GroupArrays groups(chunk);
+  for (std::size_t i = 0; i < groups.count; ++i) {
+    const RecordGroup& group = groups.groups[i];
+    const double* data = groups.data + i * kFields * kPackLanes;
+    const std::uint8_t* lane_landmark = groups.lane_landmark + i * kPackLanes;
+    const double* m = in.state.world_T_cam + 16 * group.frame;
+    const PackPoint x = pack_to_camera(m, gather_points(points.xyz, lane_landmark));
+    const PackDepth z = pack_depth(x.z);
+    const Pack g = pack_inverse_depth(z);
+    const Pack xg = x.x * g, yg = x.y * g;
+    const Pack isu = field(data, kInverseSigmaU), isv = field(data, kInverseSigmaV);
+    Pack ru = (field(data, kU) - (k.fx * xg + k.cx)) * isu;
+    Pack rv = (field(data, kV) - (k.fy * yg + k.cy)) * isv;
+    const Pack scale =
+        square_root(field(data, kWeight) * pack_weight(in.reprojection_kernels[group.reprojection], ru * ru + rv * rv));
+    ru = ru * scale;
+    rv = rv * scale;
+    // r = z - pi: the rows of -d pi / d x are (a, 0, b) and (0, c, d).
+    const Pack ku = isu * scale, kv = isv * scale;
+    const Pack slope = z.inverse * z.inverse;
+    const Pack a = -(k.fx * g * ku), b = k.fx * x.x * slope * ku;
+    const Pack c = -(k.fy * g * kv), d = k.fy * x.y * slope * kv;
+    const Pack ju[5] = {-(b * x.y), b * x.x - a * x.z, a * x.y, -a, -b};
+    const Pack jv[5] = {c * x.z - d * x.y, d * x.x, -(c * x.x), -c, -d};
+    Pack rd{}, js{}, e{}, jd[3] = {Pack{}, Pack{}, Pack{}};
+    if constexpr (kDepth) {
+      const Pack isd = field(data, kInverseSigmaDepth);
+      rd = (pack_log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) * isd;
+      const Pack scale_depth =
+          square_root(field(data, kDepthWeight) * pack_weight(in.depth_kernels[group.depth], rd * rd));
+      rd = rd * scale_depth;
+      js = -(isd * scale_depth);
+      e = -(z.inverse * js);
+      jd[0] = -(e * x.y);
+      jd[1] = e * x.x;
+      jd[2] = -e;
+    }
+
+    double* sums = frame_sums + static_cast<std::size_t>(group.frame) * kSums * kPackLanes;
+    // Pose with pose and gradient: rows u, v, depth have entries where kPoseOfU, kPoseOfV, kPoseOfDepth say.
+    add(sums, kPose + 0, plus<kDepth>(ju[0] * ju[0] + jv[0] * jv[0], jd[0], jd[0]));
+    add(sums, kPose + 1, plus<kDepth>(ju[1] * ju[0] + jv[1] * jv[0], jd[1], jd[0]));
+    add(sums, kPose + 2, plus<kDepth>(ju[1] * ju[1] + jv[1] * jv[1], jd[1], jd[1]));
+    add(sums, kPose + 3, ju[2] * ju[0] + jv[2] * jv[0]);
+    add(sums, kPose + 4, ju[2] * ju[1] + jv[2] * jv[1]);
+    add(sums, kPose + 5, ju[2] * ju[2] + jv[2] * jv[2]);
+    add(sums, kPose + 6, ju[3] * ju[0]);
+    add(sums, kPose + 7, ju[3] * ju[1]);
+    add(sums, kPose + 8, ju[3] * ju[2]);
+    add(sums, kPose + 9, ju[3] * ju[3]);
+    add(sums, kPose + 10, jv[3] * jv[0]);
+    add(sums, kPose + 11, jv[3] * jv[1]);
+    add(sums, kPose + 12, jv[3] * jv[2]);
+    add(sums, kPose + 14, jv[3] * jv[3]);
+    add(sums, kPose + 15, plus<kDepth>(ju[4] * ju[0] + jv[4] * jv[0], jd[2], jd[0]));
+    add(sums, kPose + 16, plus<kDepth>(ju[4] * ju[1] + jv[4] * jv[1], jd[2], jd[1]));
+    add(sums, kPose + 17, ju[4] * ju[2] + jv[4] * jv[2]);
+    add(sums, kPose + 18, ju[4] * ju[3]);
+    add(sums, kPose + 19, jv[4] * jv[3]);
+    add(sums, kPose + 20, plus<kDepth>(ju[4] * ju[4] + jv[4] * jv[4], jd[2], jd[2]));
+    add(sums, kPoseGradient + 0, plus<kDepth>(ju[0] * ru + jv[0] * rv, jd[0], rd));
+    add(sums, kPoseGradient + 1, plus<kDepth>(ju[1] * ru + jv[1] * rv, jd[1], rd));
+    add(sums, kPoseGradient + 2, ju[2] * ru + jv[2] * rv);
+    add(sums, kPoseGradient + 3, ju[3] * ru);
+    add(sums, kPoseGradient + 4, jv[3] * rv);
+    add(sums, kPoseGradient + 5, plus<kDepth>(ju[4] * ru + jv[4] * rv, jd[2], rd));
+    if constexpr (kDepth) {
+      for (int j = 0; j < 3; ++j) add(sums, kPoseScale + j, js * jd[j]);
+      add(sums, kScale, js * js);
+      add(sums, kScale + 1, js * rd);
+    }
+    const Pack jfx = -(xg * ku), jcx = -ku, jfy = -(yg * kv), jcy = -kv;
+    if constexpr (kIntrinsics) {
+      for (int j = 0; j < 5; ++j) {
+        add(sums, kPoseU + 2 * j, ju[j] * jfx);
+        add(sums, kPoseU + 2 * j + 1, ju[j] * jcx);
+        add(sums, kPoseV + 2 * j, jv[j] * jfy);
+        add(sums, kPoseV + 2 * j + 1, jv[j] * jcy);
+      }
+      add(sums, kIntrinsicsU + 0, jfx * jfx);
+      add(sums, kIntrinsicsU + 1, jfx * jcx);
+      add(sums, kIntrinsicsU + 2, jcx * jcx);
+      add(sums, kIntrinsicsV + 0, jfy * jfy);
+      add(sums, kIntrinsicsV + 1, jfy * jcy);
+      add(sums, kIntrinsicsV + 2, jcy * jcy);
+      add(sums, kIntrinsicsGradient + 0, jfx * ru);
+      add(sums, kIntrinsicsGradient + 1, jfy * rv);
+      add(sums, kIntrinsicsGradient + 2, jcx * ru);
+      add(sums, kIntrinsicsGradient + 3, jcy * rv);
+    }
+    if (chunk.frozen) continue;
+
+    Pack lu[3], lv[3], ld[3];
+    for (int j = 0; j < 3; ++j) {
+      lu[j] = a * m[4 * j] + b * m[4 * j + 2];
+      lv[j] = c * m[4 * j + 1] + d * m[4 * j + 2];
+      ld[j] = e * m[4 * j + 2];
+    }
+    for (int j = 0; j < 3; ++j) {
+      double* row = out + 8 * j * kPackLanes;
+      store_pack(plus<kDepth>(lu[j] * ju[0] + lv[j] * jv[0], ld[j], jd[0]), row);
+      store_pack(plus<kDepth>(lu[j] * ju[1] + lv[j] * jv[1], ld[j], jd[1]), row + kPackLanes);
+      store_pack(lu[j] * ju[2] + lv[j] * jv[2], row + 2 * kPackLanes);
+      store_pack(lu[j] * ju[3], row + 3 * kPackLanes);
+      store_pack(lv[j] * jv[3], row + 4 * kPackLanes);
+      store_pack(plus<kDepth>(lu[j] * ju[4] + lv[j] * jv[4], ld[j], jd[2]), row + 5 * kPackLanes);
+      if constexpr (kDepth) store_pack(ld[j] * js, row + 6 * kPackLanes);
+    }
+    double* point = out + kWidth * kPackLanes;
+    int place = 0;
+    for (int j = 0; j < 3; ++j)
+      for (int n = j; n < 3; ++n) store_pack(plus<kDepth>(lu[j] * lu[n] + lv[j] * lv[n], ld[j], ld[n]), point + kPackLanes * place++);
+    for (int j = 0; j < 3; ++j) store_pack(plus<kDepth>(lu[j] * ru + lv[j] * rv, ld[j], rd), point + kPackLanes * (6 + j));
+    if constexpr (kIntrinsics) {
+      for (int j = 0; j < 3; ++j) {
+        double* row = point + (9 + 4 * j) * kPackLanes;
+        store_pack(lu[j] * jfx, row);
+        store_pack(lv[j] * jfy, row + kPackLanes);
+        store_pack(lu[j] * jcx, row + 2 * kPackLanes);
+        store_pack(lv[j] * jcy, row + 3 * kPackLanes);
+      }
+    }
+    scatter_group(group, lane_landmark, groups.lane_pair + i * kPackLanes, out, coupling, by_landmark);
+  }
+  if (chunk.frozen) return;
+  for (std::size_t i = 0; i < chunk.landmarks.size(); ++i)
+    std::copy_n(by_landmark + kWidth * i, kWidth, landmarks + kWidth * static_cast<std::size_t>(chunk.landmarks[i]));
+}
+
+}  // namespace
+
+UNI4D_FG_WIDE_CLONES void energies_plain(const PassInput& in, const LandmarkChunk& chunk, double* reprojection) {
+  energies<false>(in, chunk, reprojection, nullptr);
+}
+
+UNI4D_FG_WIDE_CLONES void energies_depth(const PassInput& in, const LandmarkChunk& chunk, double* reprojection,
+                                         double* depth) {
+  energies<true>(in, chunk, reprojection, depth);
+}
+
+#define UNI4D_FG_LINEARIZE(name, depth, intrinsics)                                                             \
+  UNI4D_FG_WIDE_CLONES void name(const PassInput& in, const LandmarkChunk& chunk, double* sums, double* coupling, \
+                                 double* landmarks) {                                                           \
+    linearize<depth, intrinsics>(in, chunk, sums, coupling, landmarks);                                         \
+  }
+UNI4D_FG_LINEARIZE(linearize_plain, false, false)
+UNI4D_FG_LINEARIZE(linearize_depth, true, false)
+UNI4D_FG_LINEARIZE(linearize_intrinsics, false, true)
+UNI4D_FG_LINEARIZE(linearize_depth_intrinsics, true, true)
+#undef UNI4D_FG_LINEARIZE
+
+}  // namespace uni4d_fg::landmark_passes

@@ -1,0 +1,104 @@
+// The products of the elimination. Two frames of a chunk share the landmarks in the intersection of two bit masks;
+// their 7x8 tile of E V^{-1} E^T stays in registers over all of them.
+#include "landmark_passes.hpp"
+
+namespace uni4d_fg::landmark_passes {
+
+namespace {
+
+/// Index of the lowest bit that is set.
+UNI4D_FG_INLINE int lowest_bit(std::uint64_t mask) {
+#if defined(__GNUC__) || defined(__clang__)
+  return __builtin_ctzll(mask);
+#else
+  int bit = 0;
+  while ((mask >> bit & 1) == 0) ++bit;
+  return bit;
+#endif
+}
+
+/// tile (7, 8) += sum over landmarks of A^T B with A, B (3, 8); row 7 of the product is not used.
+struct Places {
+  const double* rows;
+  const int* row_place;
+  const double* columns;
+  const int* column_place;  ///< null: the landmark itself
+};
+
+UNI4D_FG_INLINE void multiply(std::uint64_t shared, const Places& at, double* tile) {
+  Pack sums[kFrameColumns] = {};
+  while (shared != 0) {
+    const int landmark = lowest_bit(shared);
+    shared &= shared - 1;
+    const double* a = at.rows + static_cast<std::size_t>(at.row_place[landmark]) * kWidth;
+    const int column = at.column_place != nullptr ? at.column_place[landmark] : landmark;
+    const double* b = at.columns + static_cast<std::size_t>(column) * kWidth;
+    for (int k = 0; k < 3; ++k) {
+      const Pack right = load_pack(b + k * kPackLanes);
+      for (int row = 0; row < kFrameColumns; ++row) sums[row] += a[k * kPackLanes + row] * right;
+    }
+  }
+  for (int row = 0; row < kFrameColumns; ++row)
+    store_pack(load_pack(tile + row * kPackLanes) + sums[row], tile + row * kPackLanes);
+}
+
+constexpr std::size_t kTile = kFrameColumns * kPackLanes;
+
+}  // namespace
+
+UNI4D_FG_WIDE_CLONES void whiten_pairs(const LandmarkChunk& chunk, const double* coupling, const double* factors,
+                                       double* whitened) {
+  const std::uint8_t* landmark = chunk.pair_landmark.data();
+  const auto pairs = static_cast<std::size_t>(chunk.num_pairs());
+  for (std::size_t i = 0; i < pairs; ++i) {
+    const double* in = coupling + i * kWidth;
+    const double* f = factors + 6 * landmark[i];
+    double* out = whitened + i * kWidth;
+    const Pack first = load_pack(in) * f[0];
+    const Pack second = (load_pack(in + kPackLanes) - f[1] * first) * f[2];
+    const Pack third = (load_pack(in + 2 * kPackLanes) - f[3] * first - f[4] * second) * f[5];
+    store_pack(first, out);
+    store_pack(second, out + kPackLanes);
+    store_pack(third, out + 2 * kPackLanes);
+  }
+}
+
+UNI4D_FG_WIDE_CLONES void multiply_tiles(const LandmarkChunk& chunk, const TileInput& in) {
+  const int* frames = chunk.frames.data();
+  const std::uint64_t* seen = chunk.seen.data();
+  const std::size_t count = chunk.frames.size();
+  std::uint64_t any = 0;
+  for (std::size_t i = 0; i < count; ++i) {
+    const auto frame = static_cast<std::size_t>(frames[i]);
+    const int* place = in.place + i * kChunkLandmarks;
+    any |= seen[i];
+    multiply(seen[i], {in.whitened, place, in.border, nullptr}, in.border_tiles + frame * kTile);
+    for (std::size_t j = i; j < count; ++j) {
+      const std::uint64_t shared = seen[i] & seen[j];
+      if (shared == 0) continue;
+      double* tile = in.tiles + static_cast<std::size_t>(in.tile_begin[frame] + frames[j] - frames[i]) * kTile;
+      multiply(shared, {in.whitened, place, in.whitened, in.place + j * kChunkLandmarks}, tile);
+    }
+  }
+  int own[kChunkLandmarks];
+  for (int i = 0; i < kChunkLandmarks; ++i) own[i] = i;
+  multiply(any, {in.border, own, in.border, nullptr}, in.corner_tile);
+}
+
+UNI4D_FG_WIDE_CLONES void apply_coupling(const LandmarkChunk& chunk, const double* coupling, const double* frame_step,
+                                         double* out) {
+  const std::uint8_t* landmark = chunk.pair_landmark.data();
+  const int* frames = chunk.frames.data();
+  const int* begin = chunk.frame_begin.data();
+  const std::size_t count = chunk.frames.size();
+  for (std::size_t f = 0; f < count; ++f) {
+    const Pack step = load_pack(frame_step + static_cast<std::size_t>(frames[f]) * kPackLanes);
+    for (int i = begin[f]; i < begin[f + 1]; ++i) {
+      const double* in = coupling + static_cast<std::size_t>(i) * kWidth;
+      double* point = out + 3 * landmark[i];
+      for (int k = 0; k < 3; ++k) point[k] += sum(load_pack(in + k * kPackLanes) * step);
+    }
+  }
+}
+
+}  // namespace uni4d_fg::landmark_passes
