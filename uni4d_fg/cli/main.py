@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from uni4d_fg.cli import reconstruction, results, sequences
+from uni4d_fg.cli import comparison, reconstruction, results, sequences
 from uni4d_fg.cli.console import log_to_stderr, one_line, print_error
 from uni4d_fg.errors import Cancelled, Uni4dFgError
 
@@ -24,7 +24,7 @@ app = typer.Typer(
 )
 for verb in (
     reconstruction.demo, sequences.validate, sequences.track, reconstruction.reconstruct, results.evaluate,
-    sequences.synthesize, results.config,
+    comparison.compare, sequences.synthesize, results.config,
 ):  # fmt: skip
     app.command()(verb)
 

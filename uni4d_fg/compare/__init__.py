@@ -1,0 +1,1 @@
+"""Solvers side by side: the same energies from the same starts, timed, scored and drawn."""

@@ -1,0 +1,87 @@
+"""What a comparison says: ratios, and where Levenberg-Marquardt loses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from uni4d_fg.compare.comparison import Comparison
+from uni4d_fg.compare.contest import Contest, time_ratio
+from uni4d_fg.compare.solvers import LM
+
+STAGE_OF_KIND = {"camera_init": "1", "bundle_adjustment": "2", "structure": "2", "nonrigid": "3"}
+ALL_STAGES = "1-3"
+_EQUAL = 1e-6
+
+
+@dataclass(frozen=True)
+class StageRatio:
+    """Levenberg-Marquardt against one opponent in one stage from one start."""
+
+    stage: str
+    start: str
+    opponent: str
+    time: float
+    """LM's time to the opponent's final energies over the opponent's own; infinite where it never got there."""
+    back: float
+    """The opponent's time to LM's final energies over LM's own; infinite where it never got there."""
+    energy: float
+    """LM's final exact energy over the opponent's, the largest of the stage's kinds of solves."""
+
+
+def stage_ratios(comparison: Comparison, opponent: str) -> list[StageRatio]:
+    """Return one ratio per stage and start, and one over all stages per start.
+
+    Stage 2 of the preset 'default' consists of two kinds of solves; their times are added.
+    """
+    out = []
+    starts = list(dict.fromkeys(contest.start for contest in comparison.contests))
+    for stage in dict.fromkeys(STAGE_OF_KIND.values()):
+        for start in starts:
+            contests = [c for c in comparison.contests if STAGE_OF_KIND[c.kind] == stage and c.start == start]
+            if contests:
+                out.append(_ratio(stage, start, contests, opponent))
+    common = [c for c in comparison.contests if c.start == starts[0]] if starts and starts[0] == "common" else []
+    for start in starts:
+        contests = [c for c in comparison.contests if c.start == start and c not in common]
+        if contests and common:
+            out.append(_ratio(ALL_STAGES, start, common + contests, opponent))
+    return out
+
+
+def _ratio(stage: str, start: str, contests: list[Contest], opponent: str) -> StageRatio:
+    return StageRatio(
+        stage, start, opponent, time_ratio(contests, LM, opponent), time_ratio(contests, opponent, LM),
+        max(contest.energy_ratio(LM, opponent) for contest in contests),
+    )  # fmt: skip
+
+
+def losses(comparison: Comparison) -> list[str]:
+    """Return a sentence for everything in which Levenberg-Marquardt is behind another solver."""
+    out = []
+    for contest in comparison.contests:
+        mine = contest.performances[LM]
+        for name in contest.performances:
+            if name == LM:
+                continue
+            where = f"{contest.kind} from {contest.start}"
+            ratio = contest.energy_ratio(LM, name)
+            if ratio > 1.0 + _EQUAL:
+                out.append(f"{where}: LM ends {100 * (ratio - 1):.3g} % above {name}")
+            elif mine.higher[name]:
+                out.append(f"{where}: LM ends above {name} in {mine.higher[name]} of {contest.tasks} solves")
+            time = contest.time_ratio(LM, name)
+            if 1.0 < time < math.inf:
+                out.append(f"{where}: LM needs {time:.2g} times as long as {name} to reach its energy")
+    for name, energy in comparison.camera_init_energy.items():
+        total = sum(comparison.camera_init_energy[LM].values())
+        if total > sum(energy.values()) * (1.0 + _EQUAL):
+            out.append(f"stage 1 as a whole: LM ends {100 * (total / sum(energy.values()) - 1):.3g} % above {name}")
+    for name, run in comparison.runs.items():
+        for metric, value in comparison.runs[LM].accuracy.items():
+            theirs = run.accuracy.get(metric)
+            if theirs is not None and value > theirs * (1.0 + 1e-3):
+                out.append(f"accuracy of the whole run: {metric} is {value:.4g} with LM, {theirs:.4g} with {name}")
+        if comparison.runs[LM].optimisation_seconds > run.optimisation_seconds:
+            out.append(f"whole run: stages 1 to 3 take LM longer than {name}")
+    return out
