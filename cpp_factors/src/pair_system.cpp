@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "uni4d_fg/camera.hpp"
+#include "uni4d_fg/lanes.hpp"
 #include "uni4d_fg/parallel.hpp"
 
 namespace uni4d_fg {
@@ -12,7 +13,6 @@ namespace uni4d_fg {
 namespace {
 
 constexpr int kTileRows = 64;
-constexpr int kLanes = 4;
 constexpr int kRowsPerThread = 4000;
 constexpr int kColumns = PairSystem::kColumns;
 constexpr int kSums = PairSystem::kSums;
@@ -98,21 +98,24 @@ UNI4D_FG_INLINE void tile_columns(const Pose& relative, const Intrinsics& k, dou
   }
 }
 
-/// Add the products of one column with the `count` columns from `first` on, summed over the rows of a tile.
-template <int count>
-UNI4D_FG_INLINE void add_products(const Scratch& a, int column, int first, int rows, double* sums) {
-  double lanes[count][kLanes] = {};
+/// Add the products of one column with itself and the columns after it, summed over the rows of a tile. The sums stay
+/// in registers: hence the pack instead of a loop.
+template <int column, int... after>
+UNI4D_FG_INLINE void add_products(const Scratch& a, int rows, double* sums, std::integer_sequence<int, after...>) {
+  Lanes total[sizeof...(after)] = {};
   for (int half = 0; half < 2; ++half)
-    for (int n = half * kTileRows; n < half * kTileRows + rows; n += kLanes)
-      for (int j = 0; j < count; ++j)
-        for (int lane = 0; lane < kLanes; ++lane) lanes[j][lane] += a[column][n + lane] * a[first + j][n + lane];
-  for (int j = 0; j < count; ++j) sums[j] += (lanes[j][0] + lanes[j][1]) + (lanes[j][2] + lanes[j][3]);
+    for (int n = half * kTileRows; n < half * kTileRows + rows; n += kLanes) {
+      Lanes left, right;
+      load_lanes(&a[column][n], left);
+      ((load_lanes(&a[column + after][n], right), total[after] += left * right), ...);
+    }
+  ((sums[after] += sum_of(total[after])), ...);
 }
 
 /// Add the Gram matrix of the columns, upper triangle by rows.
 template <int column>
 UNI4D_FG_INLINE void add_gram(const Scratch& a, int rows, double* sums) {
-  add_products<kColumns - column>(a, column, column, rows, sums);
+  add_products<column>(a, rows, sums, std::make_integer_sequence<int, kColumns - column>());
   if constexpr (column + 1 < kColumns) add_gram<column + 1>(a, rows, sums + kColumns - column);
 }
 

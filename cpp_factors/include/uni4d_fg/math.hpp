@@ -11,9 +11,9 @@
 
 // A hot function marked so is compiled twice, and the processor decides at load time which one runs. Everything it
 // calls in its loop must be UNI4D_FG_INLINE, or it is compiled for the oldest processor only.
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__linux__) && \
+#if defined(__GNUC__) && __GNUC__ >= 12 && !defined(__clang__) && defined(__x86_64__) && defined(__linux__) && \
     !defined(UNI4D_FG_NO_CLONES)
-#define UNI4D_FG_CLONES __attribute__((target_clones("arch=haswell", "default")))
+#define UNI4D_FG_CLONES __attribute__((target_clones("arch=x86-64-v3", "default")))
 #else
 #define UNI4D_FG_CLONES
 #endif
