@@ -127,7 +127,7 @@ void TrajectorySystem::plan() {
   for (auto* values : {&gradient_, &added_}) values->assign(3 * points, 0.0);
   inside_.assign(12 * points, 0.0);
   blocks_.assign(24 * points, 0.0);
-  factor_.assign(24 * points, 0.0);
+  factor_.assign(24 * points, 0.0F);
   planned_ = true;
 }
 

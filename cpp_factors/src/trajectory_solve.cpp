@@ -43,12 +43,12 @@ UNI4D_FG_INLINE void times_inverse_transposed(const double* b, const double* inv
 }
 
 /// out -= A v.
-UNI4D_FG_INLINE void subtract_product(const double* a, const double* v, double* out) {
+UNI4D_FG_INLINE void subtract_product(const float* a, const double* v, double* out) {
   for (int i = 0; i < 3; ++i) out[i] -= a[3 * i] * v[0] + a[3 * i + 1] * v[1] + a[3 * i + 2] * v[2];
 }
 
 /// out -= A^T v.
-UNI4D_FG_INLINE void subtract_transposed_product(const double* a, const double* v, double* out) {
+UNI4D_FG_INLINE void subtract_transposed_product(const float* a, const double* v, double* out) {
   for (int i = 0; i < 3; ++i) out[i] -= a[i] * v[0] + a[3 + i] * v[1] + a[6 + i] * v[2];
 }
 
@@ -70,9 +70,12 @@ std::pair<std::size_t, std::size_t> TrajectorySystem::chunk_points(int chunk) co
 bool TrajectorySystem::factorize_chunk(int chunk, double damping, double min_diagonal, double max_diagonal) {
   const auto [begin, end] = chunk_points(chunk);
   bool positive = true;
+  double rows[3][24];  // of this point and the two before it, in double precision
   for (std::size_t p = begin; p < end; ++p) {
     const double* block = &blocks_[24 * p];
-    double* own = &factor_[24 * p];
+    double* own = rows[p % 3];
+    const double* previous = rows[(p + 2) % 3];
+    const double* before_that = rows[(p + 1) % 3];
     double s[6];
     std::copy_n(block, 6, s);
     constexpr int kDiagonal[3] = {0, 3, 5};
@@ -84,22 +87,21 @@ bool TrajectorySystem::factorize_chunk(int chunk, double damping, double min_dia
     const auto position = static_cast<std::int64_t>(p) - track_start_[static_cast<std::size_t>(track_of_[p])];
     double* one = own + 6;
     double* two = own + 15;
-    if (position >= 2) times_inverse_transposed(block + 15, own - 48, two);
+    std::fill_n(one, 18, 0.0);
+    if (position >= 2) times_inverse_transposed(block + 15, before_that, two);
     if (position >= 1) {
       Block coupling;
       std::copy_n(block + 6, 9, coupling);
       if (position >= 2) {
-        const double* previous = own - 24 + 6;
         for (int i = 0; i < 3; ++i) {
           for (int j = 0; j < 3; ++j) {
-            for (int k = 0; k < 3; ++k) coupling[3 * i + j] -= two[3 * i + k] * previous[3 * j + k];
+            for (int k = 0; k < 3; ++k) coupling[3 * i + j] -= two[3 * i + k] * previous[6 + 3 * j + k];
           }
         }
       }
-      times_inverse_transposed(coupling, own - 24, one);
+      times_inverse_transposed(coupling, previous, one);
     }
-    for (const double* lag : {position >= 1 ? one : nullptr, position >= 2 ? two : nullptr}) {
-      if (lag == nullptr) continue;
+    for (const double* lag : {one, two}) {
       for (int i = 0, entry = 0; i < 3; ++i) {
         for (int j = i; j < 3; ++j, ++entry) {
           for (int k = 0; k < 3; ++k) s[entry] -= lag[3 * i + k] * lag[3 * j + k];
@@ -107,6 +109,9 @@ bool TrajectorySystem::factorize_chunk(int chunk, double damping, double min_dia
       }
     }
     positive &= invert_cholesky(s, own);
+    // Rounding to single precision changes the preconditioner, which stays symmetric and positive, and not the result;
+    // conjugate gradients are bound by memory.
+    for (std::size_t i = 0; i < 24; ++i) factor_[24 * p + i] = static_cast<float>(own[i]);
   }
   return positive;
 }
@@ -115,7 +120,7 @@ bool TrajectorySystem::factorize_chunk(int chunk, double damping, double min_dia
 void TrajectorySystem::precondition_chunk(int chunk, const double* vector, double* result) const {
   const auto [begin, end] = chunk_points(chunk);
   for (std::size_t p = begin; p < end; ++p) {
-    const double* own = &factor_[24 * p];
+    const float* own = &factor_[24 * p];
     const auto position = static_cast<std::int64_t>(p) - track_start_[static_cast<std::size_t>(track_of_[p])];
     double v[3] = {vector[3 * p], vector[3 * p + 1], vector[3 * p + 2]};
     double* out = result + 3 * p;
@@ -126,7 +131,7 @@ void TrajectorySystem::precondition_chunk(int chunk, const double* vector, doubl
     out[2] = own[3] * v[0] + own[4] * v[1] + own[5] * v[2];
   }
   for (std::size_t p = end; p-- > begin;) {
-    const double* own = &factor_[24 * p];
+    const float* own = &factor_[24 * p];
     const auto position = static_cast<std::int64_t>(p) - track_start_[static_cast<std::size_t>(track_of_[p])];
     double* out = result + 3 * p;
     const double v[3] = {out[0], out[1], out[2]};

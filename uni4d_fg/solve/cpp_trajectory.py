@@ -7,7 +7,6 @@ them, and the product with J^T J is formed from one direction per distance and o
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,19 +32,18 @@ def _dense(array: Any) -> FloatArray:
     return np.ascontiguousarray(array, dtype=np.float64)
 
 
-def _add(system: Any, family: FactorFamily) -> Callable[..., None] | None:
-    """Return the method that takes a batch of a family; None when there is none."""
-    methods: dict[int, Callable[..., None]] = {
-        id(DYNAMIC_REPROJECTION): system.add_dynamic_reprojection,
-        id(DYNAMIC_DEPTH_PRIOR): system.add_dynamic_depth_prior,
-        id(VELOCITY_SMOOTHNESS): system.add_smoothness,
-        id(ACCELERATION_SMOOTHNESS): system.add_smoothness,
-        id(ARAP): system.add_arap,
-    }
-    return methods.get(id(family))
+_METHODS: tuple[tuple[FactorFamily, str], ...] = (
+    (DYNAMIC_REPROJECTION, "add_dynamic_reprojection"),
+    (DYNAMIC_DEPTH_PRIOR, "add_dynamic_depth_prior"),
+    (VELOCITY_SMOOTHNESS, "add_smoothness"),
+    (ACCELERATION_SMOOTHNESS, "add_smoothness"),
+    (ARAP, "add_arap"),
+)
 
 
-_FAMILIES = (DYNAMIC_REPROJECTION, DYNAMIC_DEPTH_PRIOR, VELOCITY_SMOOTHNESS, ACCELERATION_SMOOTHNESS, ARAP)
+def _method(family: FactorFamily) -> str | None:
+    """Return the name of the method that takes batches of a family; None when there is none."""
+    return next((name for known, name in _METHODS if family == known), None)
 
 
 def supports(problem: Problem, group: str = "dynamic_point") -> bool:
@@ -53,7 +51,7 @@ def supports(problem: Problem, group: str = "dynamic_point") -> bool:
     if group not in problem.free or not problem.free[group].all():
         return False
     return all(
-        any(batch.family is family for family in _FAMILIES) and all(s.group == group for s in batch.slots)
+        _method(batch.family) is not None and all(s.group == group for s in batch.slots)
         for batch in problem.batches
     )
 
@@ -98,10 +96,10 @@ class CppTrajectoryObjective:
         self._system.plan()
 
     def _append(self, batch: FactorBatch, state: State) -> None:
-        add = _add(self._system, batch.family)
-        assert add is not None
+        name = _method(batch.family)
+        assert name is not None
         try:
-            add(
+            getattr(self._system, name)(
                 rows=[np.ascontiguousarray(s.rows, dtype=np.int64) for s in batch.slots],
                 **{name: _dense(array) for name, array in batch.data.items()},
                 sigma=_dense(batch.sigma),

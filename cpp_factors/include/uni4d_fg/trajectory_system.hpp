@@ -190,7 +190,7 @@ class TrajectorySystem {
   std::vector<double> blocks_;        ///< (P, 24) all of J^T J within a track: block, lag 1, lag 2.
   std::vector<double> loose_scale_;   ///< Smoothness beyond the bands: squared row scales (factors, 3).
   std::vector<double> added_;         ///< (3 P) damping.
-  std::vector<double> factor_;        ///< (P, 24) Cholesky: inverse of the diagonal block, lags 1 and 2.
+  std::vector<float> factor_;         ///< (P, 24) Cholesky: inverse of the diagonal block, lags 1 and 2.
 };
 
 }  // namespace uni4d_fg
