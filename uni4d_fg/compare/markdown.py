@@ -7,24 +7,28 @@ from collections.abc import Iterable
 
 from uni4d_fg.compare.comparison import Comparison
 from uni4d_fg.compare.contest import Contest, Performance
-from uni4d_fg.compare.solvers import LM
+from uni4d_fg.compare.solvers import ADAM, LM
 from uni4d_fg.compare.verdict import losses, stage_ratios
 from uni4d_fg.compare.whole_run import STAGES
+
+_LEGEND = (
+    "Times are wall times in seconds, medians over the repetitions, warm-up left out. 'time ratio' is LM's time to the "
+    "other's final exact energy over the other's own time to it; 'never' means that it is not reached, 'not lowered' "
+    "that the other ends no lower than it started. Every solve is repeated by every solver from the same state with "
+    "the same variables free."
+)
 
 
 def markdown(comparisons: list[Comparison], machine: dict[str, str], command: str) -> str:
     """Return the whole report: one section per sequence and preset."""
     parts = ["# Levenberg-Marquardt and Adam, side by side", "", f"    {command}", ""]
     parts += [", ".join(f"{name} {value}" for name, value in machine.items()), ""]
-    parts += [
-        "Times are wall times in seconds, medians over the repetitions, warm-up left out. 'time ratio' is LM's time to "
-        "the other's final exact energy over the other's own time to it; 'never' means that it is not reached, 'not lowered' that the other "
-        "ends no lower than it started. Every "
-        "solve is repeated by every solver from the same state with the same variables free.",
-        "",
-    ]
+    parts += [_LEGEND, ""]
     for comparison in comparisons:
         parts += section(comparison)
+    crossed = accuracy_table(comparisons)
+    if crossed:
+        parts += ["## Accuracy: LM with `default` and Adam with `paper`", "", *crossed, ""]
     return "\n".join(parts)
 
 
@@ -87,6 +91,24 @@ def _energy_row(contest: Contest, name: str, performance: Performance) -> list[s
         what, contest.start, name, f"{performance.total_energy:.6g}", terms(performance.energy),
         str(performance.iterations), f"{performance.seconds:.3g}", str(performance.repetitions), memory,
     ]  # fmt: skip
+
+
+def accuracy_table(comparisons: list[Comparison]) -> list[str]:
+    """Return the scores of LM with 'default' beside those of Adam with 'paper', where both were run."""
+    found = {(c.sequence, c.preset): c for c in comparisons}
+    rows = []
+    for name in dict.fromkeys(c.sequence for c in comparisons):
+        ours, theirs = found.get((name, "default")), found.get((name, "paper"))
+        if ours is None or theirs is None:
+            continue
+        reference = theirs.runs[ADAM].accuracy
+        for metric, value in ours.runs[LM].accuracy.items():
+            if metric in reference:
+                rows.append(
+                    [name, metric, f"{value:.4g}", f"{reference[metric]:.4g}", f"{value / reference[metric]:.3g}"]
+                )
+    head = ["sequence", "score", "LM, `default`", "Adam, `paper`", "LM / Adam"]
+    return table(head, rows) if rows else []
 
 
 def terms(energy: dict[str, float]) -> str:

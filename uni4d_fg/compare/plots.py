@@ -113,7 +113,7 @@ def _style(panel: Axes, title: str, label_x: str, label_y: str) -> None:
     panel.set_title(title, loc="left", fontsize=10, color=MUTED)
     panel.set_xlabel(label_x, color=INK, fontsize=9)
     panel.set_ylabel(label_y, color=INK, fontsize=9)
-    panel.tick_params(labelsize=8, colors=MUTED)
+    panel.tick_params(which="both", labelsize=8, colors=MUTED)
     panel.grid(True, which="major", color=GRID, linewidth=0.8)
     panel.set_axisbelow(True)
     for spine in panel.spines.values():
