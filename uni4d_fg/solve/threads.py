@@ -20,10 +20,15 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
+def limit_blas_threads(limit: int) -> AbstractContextManager[Any]:
+    """Limit BLAS to a number of threads per caller."""
+    limited: AbstractContextManager[Any] = _controller().limit(limits=limit, user_api="blas")
+    return limited
+
+
 def one_blas_thread() -> AbstractContextManager[Any]:
     """Limit BLAS to one thread per caller while our own threads divide the work."""
-    limited: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
-    return limited
+    return limit_blas_threads(1)
 
 
 def thread_count(requested: int | None = None) -> int:
