@@ -18,6 +18,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from scenes import PRESETS, SCENES, scene
+
 from uni4d_fg.compare.comparison import Comparison, Effort, compare_sequence
 from uni4d_fg.compare.machine import machine
 from uni4d_fg.compare.report import draw_comparison, write_report
@@ -25,12 +27,8 @@ from uni4d_fg.compare.solvers import ADAM, LM, entrants
 from uni4d_fg.compare.verdict import stage_ratios
 from uni4d_fg.config.load import load_config
 from uni4d_fg.progress import SilentReporter
-from uni4d_fg.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 
 BASELINE = Path(__file__).with_name("compare_baseline.json")
-SCENES = {"30x2000": (30, 29, 23), "60x8000": (60, 43, 31), "100x17500": (100, 50, 35)}
-"""Frames, and the grid of query points that is started every ten frames."""
-PRESETS = ("default", "paper")
 QUIET = ("output.clouds=false", "output.pictures=false")
 TOLERANCE = {"time": 2.0, "energy": 1.0005, "accuracy": 1.25}
 """Factors by which a ratio may exceed the baseline's: timings of small solves vary by two on a shared machine."""
@@ -45,9 +43,7 @@ class LineReporter(SilentReporter):
 
 
 def compare_scene(name: str, out: Path, effort: Effort, variants: list[str], resume: bool) -> list[Comparison]:
-    frames, columns, rows = SCENES[name]
-    scene = SyntheticSceneConfig(num_frames=frames, grid_columns=columns, grid_rows=rows, render_images=False)
-    sequence = make_synthetic_sequence(scene)
+    sequence = scene(name)
     done = []
     for preset in PRESETS:
         print(f"{name}, {preset}", file=sys.stderr, flush=True)
