@@ -1,0 +1,292 @@
+"""Bundle adjustment side by side: this package with and without C++, GTSAM and Ceres.
+
+    python benchmarks/bundle_adjustment.py [--sizes 60000 350000 1000000] [--repeats 3] [--threads 2] [--solvers cpp ...]
+
+Every solver gets the same synthetic problem and the same start, in a process of its own so that its peak memory
+is its own: tracks of 20 to 50 consecutive frames, pixel noise of 1 px with 3 % outliers, shared fx, fy, cx, cy,
+Huber's kernel at 1.345 px, first and last pose fixed. Every solver stops when a step lowers the cost by less than
+1e-7 of it. Printed are the fastest of the repeats, and the relative difference of the final cost to the lowest.
+
+    cpp, python   this package's Levenberg-Marquardt driver; 'set up' is sorting the factors
+    gtsam         gtsam.LevenbergMarquardtOptimizer on GeneralSFMFactor2Cal3_S2, landmarks first in the ordering,
+                  its default parameters; its calibration has a skew, held at 0 by a prior, and the fixed poses are
+                  held by priors of 1e-6. Building the graph from Python is not counted
+    ceres         pycolmap's bundle adjuster on a PINHOLE camera, SPARSE_SCHUR and DENSE_SCHUR (pip install pyceres
+                  pycolmap); Ceres' own times, its preprocessing as 'set up'; building the problem is not counted
+
+Pixels are coordinates alone, so that no solver's convention for the centre of a pixel enters. An iteration is a
+linearisation; rejected steps count to the time of the iteration they precede.
+
+The C++ solver's limits are printed with --roofline: memory bandwidth of a plain copy, the bytes that linearisation
+reads and writes per observation, and what it takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.factors import FactorBatch, Kernel, Slot
+from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.graph.problem import Problem
+from uni4d_fg.graph.state import State
+from uni4d_fg.solve.levenberg_marquardt import minimize
+from uni4d_fg.solve.objective import Objective
+from uni4d_fg.solve.schur import SchurObjective
+
+SOLVERS = ("cpp", "python", "gtsam", "ceres-sparse", "ceres-dense")
+THRESHOLD = 1.345
+TOLERANCE = 1e-7
+MAX_ITERATIONS = 50
+K = np.array([600.0, 610.0, 480.0, 270.0])
+
+
+def make_problem(observations: int, seed: int = 0) -> tuple[Problem, State]:
+    """Return about so many observations of points along the path of a camera, with a disturbed start."""
+    rng = np.random.default_rng(seed)
+    frames = 60 if observations < 200_000 else 150 if observations < 700_000 else 300
+    count = observations // 35
+    t = np.arange(frames)
+    poses = se3.se3_exp(np.stack([0.05 * np.sin(t / 17), 0.1 * np.sin(t / 23), 0 * t, 0.06 * t, 0 * t, 0 * t], axis=1))
+    length = rng.integers(20, 51, count)
+    first = rng.integers(-10, frames - 10, count)
+    middle = np.clip(first + length // 2, 0, frames - 1)
+    depth = rng.uniform(3.0, 12.0, count)
+    offset = np.stack([rng.uniform(-0.5, 0.5, count), rng.uniform(-0.35, 0.35, count), np.ones(count)], axis=1)
+    points = np.einsum("nij,nj->ni", poses[middle, :3, :3], offset * depth[:, None]) + poses[middle, :3, 3]
+    row = np.repeat(np.arange(count), length)
+    frame = np.repeat(first - np.cumsum(length) + length, length) + np.arange(length.sum())
+    seen = (frame >= 0) & (frame < frames)
+    row, frame = row[seen], frame[seen]
+    uv = project(K, world_to_camera(poses[frame], points[row])) + rng.normal(scale=1.0, size=(len(row), 2))
+    wrong = rng.uniform(size=len(row)) < 0.03
+    uv[wrong] += rng.normal(scale=20.0, size=(int(wrong.sum()), 2))
+    disturbance = rng.normal(scale=[0.003] * 3 + [0.03] * 3, size=(frames, 6))
+    disturbance[[0, -1]] = 0.0
+    state = State(
+        {
+            "pose": se3.retract(poses, disturbance),
+            "intrinsics": K[None] * 1.03,
+            "landmark": points * (1.0 + rng.normal(scale=0.05, size=(count, 1))),
+        }
+    )
+    slots = (Slot("pose", frame), Slot("landmark", row), Slot("intrinsics", np.zeros(len(row), dtype=np.int64)))
+    batch = FactorBatch.create(STATIC_REPROJECTION, slots, {"uv": uv}, kernel=Kernel("huber", THRESHOLD))
+    free = {
+        "landmark": np.ones((count, 3), dtype=bool),
+        "pose": np.ones((frames, 6), dtype=bool),
+        "intrinsics": np.ones((1, 4), dtype=bool),
+    }
+    free["pose"][[0, -1]] = False
+    return Problem((batch,), free), state
+
+
+def solve_ours(problem: Problem, state: State, threads: int, cpp: bool) -> dict[str, float]:
+    config = SolverConfig(relative_decrease=TOLERANCE, max_iterations=MAX_ITERATIONS)
+    began = time.perf_counter()
+    objective: Objective[State]
+    if cpp:
+        from uni4d_fg.solve.cpp_schur import CppSchurObjective
+
+        objective = CppSchurObjective(problem, state, config, threads=threads)
+    else:
+        objective = SchurObjective(problem, state, config, threads=threads)
+    set_up = time.perf_counter() - began
+    _, summary = minimize(objective, state, config)
+    phases = {name: value for name, value in summary.seconds.items() if name != "total"}
+    return {
+        "cost": summary.final_energy,
+        "iterations": len(summary.iterations),
+        "set up": set_up,
+        "total": set_up + summary.seconds["total"],
+        **phases,
+    }
+
+
+def solve_gtsam(problem: Problem, state: State, threads: int) -> dict[str, float]:
+    import gtsam
+
+    from uni4d_fg.graph import keys
+
+    (batch,) = problem.batches
+    graph = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(THRESHOLD), gtsam.noiseModel.Unit.Create(2)
+    )
+    pose, landmark, _ = (s.rows.tolist() for s in batch.slots)
+    intrinsics = keys.intrinsics_key()
+    for uv, frame, row in zip(batch.data["uv"], pose, landmark, strict=True):
+        graph.push_back(
+            gtsam.GeneralSFMFactor2Cal3_S2(uv, noise, keys.pose_key(frame), keys.landmark_key(row), intrinsics)
+        )
+    fx, fy, cx, cy = state["intrinsics"][0]
+    skew = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e6, 1e6, 1e-6, 1e6, 1e6]))
+    graph.push_back(gtsam.PriorFactorCal3_S2(intrinsics, gtsam.Cal3_S2(fx, fy, 0.0, cx, cy), skew))
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    last = len(state["pose"]) - 1
+    for frame in (0, last):
+        graph.push_back(gtsam.PriorFactorPose3(keys.pose_key(frame), gtsam.Pose3(state["pose"][frame]), tight))
+    values = gtsam.Values()
+    ordering = gtsam.Ordering()
+    for row, point in enumerate(state["landmark"]):
+        values.insert(keys.landmark_key(row), point)
+        ordering.push_back(keys.landmark_key(row))
+    for frame, matrix in enumerate(state["pose"]):
+        values.insert(keys.pose_key(frame), gtsam.Pose3(matrix))
+        ordering.push_back(keys.pose_key(frame))
+    values.insert(intrinsics, gtsam.Cal3_S2(fx, fy, 0.0, cx, cy))
+    ordering.push_back(intrinsics)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(TOLERANCE)
+    parameters.setAbsoluteErrorTol(0.0)
+    parameters.setMaxIterations(MAX_ITERATIONS)
+    parameters.setOrdering(ordering)
+    began = time.perf_counter()
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+    set_up = time.perf_counter() - began
+    optimizer.optimize()
+    total = time.perf_counter() - began
+    return {"cost": optimizer.error(), "iterations": optimizer.iterations(), "set up": set_up, "total": total}
+
+
+def solve_ceres(problem: Problem, state: State, threads: int, kind: str) -> dict[str, float]:
+    import pyceres
+    import pycolmap
+
+    (batch,) = problem.batches
+    pose, landmark = batch.slots[0].rows, batch.slots[1].rows
+    scene = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="PINHOLE", width=960, height=540, params=state["intrinsics"][0], camera_id=1)
+    scene.add_camera_with_trivial_rig(camera)
+    order = np.argsort(pose, kind="stable")
+    start = np.searchsorted(pose[order], np.arange(len(state["pose"]) + 1))
+    place = np.empty(len(pose), dtype=np.int64)
+    config = pycolmap.BundleAdjustmentConfig()
+    for frame, matrix in enumerate(state["pose"]):
+        rows = order[start[frame] : start[frame + 1]]
+        place[rows] = np.arange(len(rows))
+        image = pycolmap.Image(name=str(frame), keypoints=batch.data["uv"][rows], camera_id=1, image_id=frame + 1)
+        scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(matrix)[:3]))
+        config.add_image(frame + 1)
+    for frame in (0, len(state["pose"]) - 1):
+        config.set_constant_rig_from_world_pose(frame + 1)
+    by_landmark = np.argsort(landmark, kind="stable")
+    first = np.searchsorted(landmark[by_landmark], np.arange(len(state["landmark"]) + 1))
+    for row, point in enumerate(state["landmark"]):
+        elements = [
+            pycolmap.TrackElement(int(pose[n]) + 1, int(place[n])) for n in by_landmark[first[row] : first[row + 1]]
+        ]
+        scene.add_point3D(point, pycolmap.Track(elements))
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = True
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
+    options.ceres.loss_function_scale = THRESHOLD
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
+    solver = pyceres.SolverOptions()
+    solver.linear_solver_type = getattr(pyceres.LinearSolverType, kind)
+    solver.num_threads = threads
+    solver.function_tolerance = TOLERANCE
+    solver.gradient_tolerance = solver.parameter_tolerance = 0.0
+    solver.max_num_iterations = MAX_ITERATIONS
+    solver.logging_type = pyceres.LoggingType.SILENT
+    summary = pyceres.SolverSummary()
+    pyceres.solve(solver, adjuster.problem, summary)
+    return {
+        "cost": summary.final_cost,
+        "iterations": summary.num_successful_steps + summary.num_unsuccessful_steps,
+        "set up": summary.preprocessor_time_in_seconds,
+        "total": summary.total_time_in_seconds,
+        "linearize": summary.jacobian_evaluation_time_in_seconds,
+        "solve": summary.linear_solver_time_in_seconds,
+        "evaluate": summary.residual_evaluation_time_in_seconds,
+    }
+
+
+RUN: dict[str, Callable[[Problem, State, int], dict[str, float]]] = {
+    "cpp": lambda problem, state, threads: solve_ours(problem, state, threads, True),
+    "python": lambda problem, state, threads: solve_ours(problem, state, threads, False),
+    "gtsam": solve_gtsam,
+    "ceres-sparse": lambda problem, state, threads: solve_ceres(problem, state, threads, "SPARSE_SCHUR"),
+    "ceres-dense": lambda problem, state, threads: solve_ceres(problem, state, threads, "DENSE_SCHUR"),
+}
+
+
+def run_here(solver: str, size: int, threads: int) -> None:
+    """Solve once in this process and print the result as JSON."""
+    problem, state = make_problem(size)
+    result: dict[str, Any] = {"before_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+    result |= RUN[solver](problem, state, threads)
+    result["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    result |= {"observations": len(problem.batches[0]), "landmarks": len(state["landmark"])}
+    result["frames"] = len(state["pose"])
+    print(json.dumps(result))
+
+
+def run_apart(solver: str, size: int, threads: int, repeats: int) -> dict[str, Any] | None:
+    """Solve in processes of their own and return the fastest; None if the solver is not installed."""
+    command = [sys.executable, __file__, "--here", solver, "--sizes", str(size), "--threads", str(threads)]
+    results = []
+    for _ in range(repeats):
+        done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "2"})
+        if done.returncode != 0:
+            print(f"{solver} at {size}: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
+            return None
+        results.append(json.loads(done.stdout.strip().splitlines()[-1]))
+    return min(results, key=lambda result: float(result["total"]))
+
+
+def table(size: int, results: dict[str, dict[str, Any]]) -> None:
+    """Print one size."""
+    any_result = next(iter(results.values()))
+    lowest = min(result["cost"] for result in results.values())
+    reference = results.get("cpp", any_result)
+    per_iteration = {name: (r["total"] - r["set up"]) / max(r["iterations"], 1) for name, r in results.items()}
+    own = per_iteration["cpp" if "cpp" in results else next(iter(results))]
+    print(
+        f"\n{any_result['observations']} observations, {any_result['landmarks']} landmarks, "
+        f"{any_result['frames']} frames; cost {lowest:.6g}\n"
+    )
+    print("| solver | total, s | ratio | s / iteration | ratio | iterations | set up | linearise | solve | evaluate |", end="")
+    print(" peak memory, MB | of which solver | cost above lowest |\n|---|" + "---|" * 12)
+    for name, r in results.items():
+        phases = " | ".join(f"{r[phase]:.3f}" if phase in r else "" for phase in ("linearize", "solve", "evaluate"))
+        above = r["cost"] / lowest - 1.0
+        print(
+            f"| {name} | {r['total']:.3f} | {r['total'] / reference['total']:.1f} | {per_iteration[name]:.4f} | "
+            f"{per_iteration[name] / own:.1f} | {r['iterations']} | {r['set up']:.3f} | {phases} | "
+            f"{r['peak_mb']:.0f} | {r['peak_mb'] - r['before_mb']:.0f} | {above:.1e}{'' if above < 1e-6 else ' (!)'} |"
+        )
+
+
+def main() -> None:
+    """Print one table per size."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[60_000, 350_000, 1_000_000])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), choices=SOLVERS)
+    parser.add_argument("--here", choices=SOLVERS, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.here:
+        run_here(arguments.here, arguments.sizes[0], arguments.threads)
+        return
+    for size in arguments.sizes:
+        results = {name: run_apart(name, size, arguments.threads, arguments.repeats) for name in arguments.solvers}
+        table(size, {name: result for name, result in results.items() if result is not None})
+
+
+if __name__ == "__main__":
+    main()
