@@ -43,7 +43,7 @@ class CameraInitConfig(Section):
     camera_motion: CameraMotionConfig = setting(
         CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0), "E_cam within the window."
     )
-    solver: SolverConfig = setting(SolverConfig(max_iterations=15, relative_decrease=1e-3), "Solver of each window.")
+    solver: SolverConfig = setting(SolverConfig(max_iterations=20, relative_decrease=1e-5), "Solver of each window.")
 
 
 class BundleAdjustmentConfig(Section):
@@ -106,6 +106,10 @@ class BundleAdjustmentConfig(Section):
         "'keep': as they are.",
     )
     solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.")
+    structure_solver: SolverConfig = setting(
+        SolverConfig(max_iterations=40, relative_decrease=1e-5),
+        "Solver of 'refine': nothing couples the landmarks but the scales, and small steps still pay.",
+    )
 
 
 class NonRigidConfig(Section):
@@ -157,7 +161,7 @@ class NonRigidConfig(Section):
         0.98, "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.", gt=0, le=1
     )
     outlier_margin: float = setting(1.0, "Added to that quantile.", ge=0)
-    solver: SolverConfig = setting(SolverConfig(max_iterations=20, relative_decrease=1e-4), "Solver.")
+    solver: SolverConfig = setting(SolverConfig(max_iterations=40, relative_decrease=1e-6), "Solver.")
 
 
 class FusionConfig(Section):

@@ -145,7 +145,7 @@ def structure_stage(
         "landmark": np.ones((len(state["landmark"]), 3), dtype=bool),
         "log_scale": np.ones((num_frames, 1), dtype=bool),
     }
-    return Stage("structure", (reprojection, *depth), free, config.solver, "schur", eliminate="landmark")
+    return Stage("structure", (reprojection, *depth), free, config.structure_solver, "schur", eliminate="landmark")
 
 
 def _reprojection_term(
