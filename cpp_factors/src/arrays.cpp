@@ -15,16 +15,16 @@ Imported import(const AnyArray& argument, const char* name) {
   const nb::object& object = argument.object;
   // Only plain numbers reach nanobind's import: strings and dates have no DLPack type.
   Imported array;
-  std::string got = nb::inst_name(object).c_str();
   bool numeric = false;
-  if (nb::hasattr(object, "dtype") && nb::hasattr(object.attr("dtype"), "kind")) {
-    const nb::object dtype = object.attr("dtype");
+  const nb::object dtype = nb::getattr(object, "dtype", nb::none());
+  if (nb::hasattr(dtype, "kind")) {
     const nb::str kind(dtype.attr("kind"));
     numeric = std::string("biufc").find(kind.c_str()) != std::string::npos && nb::cast<bool>(dtype.attr("isnative"));
-    got += std::string(" of ") + nb::str(dtype).c_str();
   }
   if (!numeric || !nb::try_cast(object, array, false) || !array.is_valid()) {
     PyErr_Clear();
+    std::string got = nb::inst_name(object).c_str();
+    if (!dtype.is_none()) got += std::string(" of ") + nb::str(dtype).c_str();
     throw nb::type_error((std::string(name) + ": expected a numeric NumPy array, got " + got).c_str());
   }
   return array;

@@ -13,7 +13,7 @@ namespace uni4d_fg {
 namespace {
 
 constexpr int kTileRows = 64;
-constexpr int kRowsPerThread = 4000;
+constexpr int kRowsPerThread = 16000;
 constexpr int kColumns = PairSystem::kColumns;
 constexpr int kSums = PairSystem::kSums;
 

@@ -35,7 +35,11 @@ class Config(Section):
         "Minimiser of every stage: 'lm' is Levenberg-Marquardt; 'adam' is the first-order baseline, which needs "
         "PyTorch and is made for the preset 'paper'.",
     )
-    seed: int = setting(0, "Seed of every random choice.", ge=0)
+    backend: Literal["auto", "cpp", "python", "gtsam"] = setting(
+        "auto",
+        "Implementation of 'lm': 'cpp' is the extension in cpp_factors/, 'python' is NumPy, 'auto' the first of "
+        "these that is installed; 'gtsam' is a GTSAM factor graph, slow, for comparison.",
+    )
     input: InputConfig = setting(InputConfig(), "Use of what the sequence brings.")
     tracking: TrackingConfig = setting(TrackingConfig(), "Built-in tracker.")
     labels: LabelConfig = setting(LabelConfig(), "Track labels.")

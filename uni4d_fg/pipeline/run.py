@@ -19,7 +19,7 @@ from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.leftovers import remove_leftovers
-from uni4d_fg.pipeline.solver import solver_settings, stage_runner
+from uni4d_fg.pipeline.solver import solver_facts, solver_settings, stage_runner
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
@@ -129,7 +129,8 @@ def reconstruct(
             "root": None if sequence.root is None else str(sequence.root.resolve()),
             "num_frames": sequence.num_frames,
             "image_size": [height, width],
-        }
+        },
+        solver_facts(config),
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,

@@ -18,6 +18,8 @@ class RunSummary:
 
     sequence: dict[str, Any]
     """Name, root, frames, image size."""
+    solver: dict[str, str] = field(default_factory=dict)
+    """Minimiser, its backend, and a hint at a faster one."""
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Per stage: seconds, peak memory, whether it was resumed, solves, dropped counts."""
     warnings: list[str] = field(default_factory=list)
@@ -27,6 +29,7 @@ class RunSummary:
         """Return plain data for JSON."""
         return {
             "sequence": self.sequence,
+            "solver": self.solver,
             "stages": self.stages,
             "warnings": self.warnings,
             "versions": versions(),
@@ -46,6 +49,10 @@ class RunSummary:
             out += [f"    {text}" for text in stage.get("facts", [])]
             dropped = {reason: n for reason, n in stage.get("dropped", {}).items() if n}
             out += [f"    dropped: {n} x {reason}" for reason, n in dropped.items()]
+        if "backend" in self.solver:
+            out.append(f"backend: {self.solver['backend']}")
+        if "hint" in self.solver:
+            out.append(f"note: {self.solver['hint']}")
         out += [f"warning: {text}" for text in self.warnings]
         return out
 
@@ -66,7 +73,7 @@ def peak_memory_mb() -> float:
 def versions() -> dict[str, str]:
     """Return the versions a result depends on."""
     out = {"python": platform.python_version()}
-    for package in ("uni4d-fg", "gtsam", "numpy", "scipy", "opencv-python-headless", "open3d", "torch"):
+    for package in ("uni4d-fg", "uni4d-fg-cpp", "gtsam", "numpy", "scipy", "opencv-python-headless", "open3d", "torch"):
         try:
             out[package] = version(package)
         except PackageNotFoundError:

@@ -49,25 +49,28 @@ class PairSource:
 
     def __init__(self, labelled: LabelledTracks, max_tracks: int):
         keep = labelled.label == int(TrackLabel.STATIC)
-        self.uv = labelled.tracks.uv[keep].astype(np.float64)
-        self.depth = labelled.depth[keep].astype(np.float64)
-        self.weight = labelled.weight[keep].astype(np.float64)
+        # By frame: a pair reads two frames of many tracks.
+        self.uv = np.ascontiguousarray(labelled.tracks.uv[keep].swapaxes(0, 1), dtype=np.float64)
+        self.depth = np.ascontiguousarray(labelled.depth[keep].T, dtype=np.float64)
+        self.weight = np.ascontiguousarray(labelled.weight[keep].T, dtype=np.float64)
         self.seen: BoolArray = self.weight > 0
         self.liftable: BoolArray = self.seen & np.isfinite(self.depth)
         self.max_tracks = max_tracks
         self._tracks: dict[tuple[int, int], IntArray] = {}
+        self._rows: dict[tuple[int, int], tuple[FloatArray, ...]] = {}
 
     def shared(self, frames: list[int], newest: int) -> int:
         """Return the number of residuals that link ``newest`` to ``frames`` before thinning, both ways."""
         return sum(
-            int((self.liftable[:, i] & self.seen[:, newest]).sum() + (self.liftable[:, newest] & self.seen[:, i]).sum())
+            int(np.count_nonzero(self.liftable[i] & self.seen[newest]))
+            + int(np.count_nonzero(self.liftable[newest] & self.seen[i]))
             for i in frames
         )
 
     def tracks(self, source: int, target: int) -> IntArray:
         """Return the tracks liftable in ``source`` and seen in ``target``, thinned evenly."""
         if (source, target) not in self._tracks:
-            common = np.flatnonzero(self.liftable[:, source] & self.seen[:, target])
+            common = np.flatnonzero(self.liftable[source] & self.seen[target])
             if self.max_tracks and len(common) > self.max_tracks:
                 common = common[np.linspace(0, len(common) - 1, self.max_tracks).astype(np.int64)]
             self._tracks[source, target] = common
@@ -87,24 +90,37 @@ class PairSource:
     def forget_before(self, frame: int) -> None:
         """Drop cached pairs whose frames have left the window."""
         self._tracks = {pair: tracks for pair, tracks in self._tracks.items() if min(pair) >= frame}
+        self._rows = {pair: rows for pair, rows in self._rows.items() if min(pair) >= frame}
+
+    def rows(self, source: int, target: int) -> tuple[FloatArray, ...]:
+        """Return source pixels (n, 2), depths (n,), target pixels (n, 2) and weights (n,) of a pair's factors."""
+        if (source, target) not in self._rows:
+            k = self.tracks(source, target)
+            self._rows[source, target] = (
+                self.uv[source][k],
+                self.depth[source][k],
+                self.uv[target][k],
+                np.sqrt(self.weight[source][k] * self.weight[target][k]),
+            )
+        return self._rows[source, target]
 
     def batch(
         self, pairs: list[tuple[int, int]], config: CameraInitConfig, unsquared: bool, normalization: Normalization
     ) -> FactorBatch:
         """Return the factors of ordered frame pairs (source, target)."""
-        tracks = [self.tracks(i, j) for i, j in pairs]
-        k = np.concatenate([np.zeros(0, dtype=np.int64), *tracks])
-        counts = np.array([len(t) for t in tracks], dtype=np.int64)
+        rows = [self.rows(i, j) for i, j in pairs]
+        none = tuple(np.zeros(shape) for shape in ((0, 2), 0, (0, 2), 0))
+        uv_source, depth, uv_target, weight = (np.concatenate(parts) for parts in zip(none, *rows, strict=True))
+        counts = np.array([len(parts[1]) for parts in rows], dtype=np.int64)
         source = np.repeat(np.array([i for i, _ in pairs], dtype=np.int64), counts)
         target = np.repeat(np.array([j for _, j in pairs], dtype=np.int64), counts)
-        weight = np.sqrt(self.weight[k, source] * self.weight[k, target])
         if unsquared and normalization == "mean":
             pair_of_row = np.repeat(np.arange(len(pairs)), counts)
             weight /= len(pairs) * np.bincount(pair_of_row, weight, len(pairs))[pair_of_row]
         return FactorBatch.create(
             DEPTH_REPROJECTION,
-            (Slot("pose", source), Slot("pose", target), Slot("intrinsics", np.zeros(len(k), dtype=np.int64))),
-            {"uv_source": self.uv[k, source], "depth": self.depth[k, source], "uv_target": self.uv[k, target]},
+            (Slot("pose", source), Slot("pose", target), Slot("intrinsics", np.zeros(len(depth), dtype=np.int64))),
+            {"uv_source": uv_source, "depth": depth, "uv_target": uv_target},
             sigma=1.0 if unsquared else config.reprojection_sigma_px,
             weight=weight,
             kernel=kernel_of(config.kernel),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.solver import KernelConfig, SolverConfig
@@ -12,11 +12,9 @@ from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.kernels import Kernel
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import State
+from uni4d_fg.solve.backend import Backend, LinearSolver, choose_backend, make_objective, solved_by
 from uni4d_fg.solve.levenberg_marquardt import Hooks, minimize
-from uni4d_fg.solve.objective import Objective
-from uni4d_fg.solve.schur import SchurObjective
 from uni4d_fg.solve.summary import SolveSummary, Termination
-from uni4d_fg.solve.trajectory_cg import TrajectoryObjective
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Stage:
     free: Mapping[str, BoolArray]
     """Free entries per group (n, tangent dim); absent groups are frozen."""
     solver: SolverConfig
-    linear_solver: Literal["schur", "trajectory_cg"] = "schur"
+    linear_solver: LinearSolver = "schur"
     eliminate: str | None = None
     """Group eliminated before the dense solve ('schur')."""
     annealing: tuple[float, ...] = (1.0,)
@@ -50,30 +48,59 @@ StageRunner: TypeAlias = Callable[[Stage, State, Hooks | None], tuple[State, Sol
 """``run(stage, state, hooks)``: what solves a stage; :func:`run_stage`, or another minimiser of the same energy."""
 
 
-def run_stage(stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
+def run_stage(
+    stage: Stage, state: State, hooks: Hooks | None = None, backend: Backend | None = None
+) -> tuple[State, SolveSummary]:
     """Solve a stage from ``state``; the summary's energies are those of the final kernels.
+
+    Args:
+        stage: What to solve.
+        state: Starting point.
+        hooks: Progress and cancellation.
+        backend: Implementation; the fastest that is installed when None.
 
     Raises:
         SolverError: See :func:`uni4d_fg.solve.levenberg_marquardt.minimize`.
     """
+    backend = backend or choose_backend("auto")
     problem = stage.problem
-    initial = problem.energies(state)
     if not stage.reads_free_variables:
+        initial = problem.energies(state)
         return state, SolveSummary(stage.name, Termination.NOTHING_TO_DO, initial, initial, (), {"total": 0.0})
+    # A round without smoothing measures the stage's own energy; GTSAM measures it behind the camera otherwise.
+    exact = [factor == 1.0 and backend.name != "gtsam" for factor in stage.annealing]
+    initial = {} if exact[0] else problem.energies(state)
     parts: list[SolveSummary] = []
+    solvers: list[str] = []
     for factor in stage.annealing:
-        objective = _objective(stage, Problem(_smoothed(stage.batches, factor), stage.free), state)
+        objective = make_objective(
+            backend,
+            Problem(_smoothed(stage.batches, factor), stage.free),
+            state,
+            stage.solver,
+            eliminate=stage.eliminate,
+            linear_solver=stage.linear_solver,
+        )
         state, summary = minimize(objective, state, stage.solver, name=stage.name, hooks=hooks)
         parts.append(summary)
+        solvers.append(solved_by(objective))
         if summary.termination is Termination.CANCELLED:
             break
-    return state, _join(stage, problem, initial, state, parts)
+    initial = parts[0].initial_energies if exact[0] else initial
+    final = parts[-1].final_energies if exact[len(parts) - 1] else problem.energies(state)
+    notes = {"backend": backend.name, "solved_by": solvers[-1]}
+    return state, _join(stage, problem, (initial, final), parts, notes)
 
 
-def _objective(stage: Stage, problem: Problem, state: State) -> Objective[State]:
-    if stage.linear_solver == "trajectory_cg":
-        return TrajectoryObjective(problem, state, stage.solver)
-    return SchurObjective(problem, state, stage.solver, stage.eliminate)
+@dataclass(frozen=True)
+class LevenbergMarquardtRunner:
+    """Solves stages by Levenberg-Marquardt with one backend; a ``StageRunner``."""
+
+    backend: Backend
+
+    def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
+        """Solve a stage; see :func:`run_stage`."""
+        return run_stage(stage, state, hooks, self.backend)
 
 
 def _smoothed(batches: tuple[FactorBatch, ...], factor: float) -> tuple[FactorBatch, ...]:
@@ -86,7 +113,11 @@ def _smoothed(batches: tuple[FactorBatch, ...], factor: float) -> tuple[FactorBa
 
 
 def _join(
-    stage: Stage, problem: Problem, initial: dict[str, float], state: State, parts: list[SolveSummary]
+    stage: Stage,
+    problem: Problem,
+    energies: tuple[dict[str, float], dict[str, float]],
+    parts: list[SolveSummary],
+    notes: dict[str, Any],
 ) -> SolveSummary:
     seconds: dict[str, float] = {}
     iterations = []
@@ -95,12 +126,12 @@ def _join(
         iterations += [replace(record, seconds=record.seconds + offset) for record in part.iterations]
         for phase, value in part.seconds.items():
             seconds[phase] = seconds.get(phase, 0.0) + value
-    notes: dict[str, Any] = {"rounds": len(parts)} if len(parts) > 1 else {}
+    if len(parts) > 1:
+        notes = {**notes, "rounds": len(parts)}
     return SolveSummary(
         stage.name,
         parts[-1].termination,
-        initial,
-        problem.energies(state),
+        *energies,
         tuple(iterations),
         seconds,
         num_factors=sum(len(batch) for batch in stage.batches),
