@@ -182,14 +182,6 @@ void bind_trajectory_system(nb::module_& module) {
              nb::gil_scoped_release release;
              self.plan();
            })
-      .def("set_kernel",
-           [](TrajectorySystem& self, int batch, int kernel, double threshold) {
-             if (batch < 0 || batch >= self.num_batches()) {
-               refuse("batch: " + std::to_string(batch) + " is outside [0, " + std::to_string(self.num_batches()) + ")");
-             }
-             self.set_kernel(batch, expect_kernel(kernel, threshold));
-           },
-           "batch"_a, "kernel"_a, "threshold"_a)
       .def_prop_ro("num_points", &TrajectorySystem::num_points)
       .def_prop_ro("num_batches", &TrajectorySystem::num_batches)
       .def_prop_ro("threads", &TrajectorySystem::threads)

@@ -111,11 +111,6 @@ void TrajectorySystem::add_arap(const TrajectoryRows& rows) {
   batches_.push_back(make_batch(rows, Kind::kArap, 4, 1));
 }
 
-void TrajectorySystem::set_kernel(int batch, Kernel kernel) {
-  batches_[static_cast<std::size_t>(batch)].kernel = kernel;
-  linearized_ = false;
-}
-
 void TrajectorySystem::plan() {
   plan_chunks();
   for (Batch& batch : batches_) {

@@ -14,6 +14,13 @@ class SolverConfig(Section):
     relative_decrease: float = setting(
         1e-5, "Stop when an accepted step lowers the energy by less than this part.", gt=0, lt=1
     )
+    smoothed_relative_decrease: float | None = setting(
+        None,
+        "The same for rounds of a stage that smooth its norms more than the last one does (annealing): they only lead "
+        "there. Null takes relative_decrease.",
+        gt=0,
+        lt=1,
+    )
     gradient_tolerance: float = setting(1e-10, "Stop when the scaled gradient's largest entry is below this.", ge=0)
     step_tolerance: float = setting(1e-9, "Stop when the step's norm is below this.", ge=0)
     initial_damping: float = setting(1e-4, "First damping, relative to the Hessian's diagonal.", gt=0)

@@ -23,9 +23,8 @@ from uni4d_fg.factors.temporal_smoothness import ACCELERATION_SMOOTHNESS, VELOCI
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import State
 from uni4d_fg.solve.diagnosis import undetermined, undetermined_message
+from uni4d_fg.solve.extension import KERNEL_CODES, import_extension
 from uni4d_fg.solve.objective import Step
-
-_KERNEL_CODES = {"quadratic": 0, "huber": 1, "pseudo_huber": 2, "cauchy": 3, "norm": 4}
 
 
 def _dense(array: Any) -> FloatArray:
@@ -51,8 +50,7 @@ def supports(problem: Problem, group: str = "dynamic_point") -> bool:
     if group not in problem.free or not problem.free[group].all():
         return False
     return all(
-        _method(batch.family) is not None and all(s.group == group for s in batch.slots)
-        for batch in problem.batches
+        _method(batch.family) is not None and all(s.group == group for s in batch.slots) for batch in problem.batches
     )
 
 
@@ -79,17 +77,16 @@ class CppTrajectoryObjective:
 
         Raises:
             SolverError: If the problem is not supported or a measured value is not finite.
-            ModuleNotFoundError: If the package ``uni4d_fg_cpp`` is not installed.
+            MissingDependencyError: If the package ``uni4d_fg_cpp`` is not installed.
         """
-        from uni4d_fg_cpp import _core
-
+        core = import_extension()
         if not supports(problem, group):
             raise SolverError(f"the C++ trajectory solver does not take this problem on {group}")
         self.problem, self.config, self.group = problem, config, group
         self.num_points = len(state[group])
         names = state.names.dynamic_track_frame
         track = np.arange(self.num_points) if names is None else np.ascontiguousarray(names[:, 0], dtype=np.int64)
-        self._system: Any = _core.TrajectorySystem(track, threads or 0)
+        self._system: Any = core.TrajectorySystem(track, threads or 0)
         self._batches = [batch for batch in problem.batches if len(batch)]
         for batch in self._batches:
             self._append(batch, state)
@@ -104,7 +101,7 @@ class CppTrajectoryObjective:
                 **{name: _dense(array) for name, array in batch.data.items()},
                 sigma=_dense(batch.sigma),
                 weight=_dense(batch.weight),
-                kernel=_KERNEL_CODES[batch.kernel.kind],
+                kernel=KERNEL_CODES[batch.kernel.kind],
                 threshold=batch.kernel.threshold,
             )
         except ValueError as error:
@@ -116,18 +113,6 @@ class CppTrajectoryObjective:
         """Raise the error that names the factor of a batch that is not finite at ``state``, if one is."""
         with np.errstate(all="ignore"):
             batch.check(*batch.family.linearize(*batch.gather(state), **batch.data), state)
-
-    def with_kernels(self, problem: Problem) -> CppTrajectoryObjective:
-        """Take the kernels of ``problem``, whose batches are otherwise those of this one; keeps the plan.
-
-        Returns:
-            This objective, changed.
-        """
-        self.problem = problem
-        self._batches = [batch for batch in problem.batches if len(batch)]
-        for index, batch in enumerate(self._batches):
-            self._system.set_kernel(index, _KERNEL_CODES[batch.kernel.kind], batch.kernel.threshold)
-        return self
 
     def _points(self, state: State) -> FloatArray:
         return _dense(state[self.group])

@@ -73,15 +73,16 @@ def run_stage(
     parts: list[SolveSummary] = []
     solvers: list[str] = []
     for factor in stage.annealing:
+        solver = _round_solver(stage, factor)
         objective = make_objective(
             backend,
             Problem(_smoothed(stage.batches, factor), stage.free),
             state,
-            stage.solver,
+            solver,
             eliminate=stage.eliminate,
             linear_solver=stage.linear_solver,
         )
-        state, summary = minimize(objective, state, stage.solver, name=stage.name, hooks=hooks)
+        state, summary = minimize(objective, state, solver, name=stage.name, hooks=hooks)
         parts.append(summary)
         solvers.append(solved_by(objective))
         if summary.termination is Termination.CANCELLED:
@@ -101,6 +102,14 @@ class LevenbergMarquardtRunner:
     def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
         """Solve a stage; see :func:`run_stage`."""
         return run_stage(stage, state, hooks, self.backend)
+
+
+def _round_solver(stage: Stage, factor: float) -> SolverConfig:
+    """Return the solver's options for one round of annealing."""
+    looser = stage.solver.smoothed_relative_decrease
+    if looser is None or factor == stage.annealing[-1]:
+        return stage.solver
+    return stage.solver.model_copy(update={"relative_decrease": looser})
 
 
 def _smoothed(batches: tuple[FactorBatch, ...], factor: float) -> tuple[FactorBatch, ...]:

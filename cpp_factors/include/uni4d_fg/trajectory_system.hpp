@@ -69,8 +69,6 @@ class TrajectorySystem {
 
   /// Order the factors and plan all sums; call once after the last batch.
   void plan();
-  /// Replace the robust kernel of a batch; the plan stays.
-  void set_kernel(int batch, Kernel kernel);
 
   int num_batches() const { return static_cast<int>(batches_.size()); }
   std::int64_t num_points() const { return num_points_; }
