@@ -184,7 +184,7 @@ def test_the_message_says_which_layer_a_value_came_from(tmp_path: Path) -> None:
     path = write(tmp_path / "mine.yaml", "camera_init:\n  window: -1\n")
     with pytest.raises(ConfigError, match=r"mine\.yaml: camera_init\.window: got -1"):
         load_config(path, ["energy=map"])
-    with pytest.raises(ConfigError, match="--set: camera_init.window: got -2"):
+    with pytest.raises(ConfigError, match=r"--set: camera_init\.window: got -2"):
         load_config(path, ["camera_init.window=-2"])
 
 

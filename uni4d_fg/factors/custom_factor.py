@@ -22,6 +22,9 @@ from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import TANGENT_DIM, State, values_at
 
+CALIBRATION_ENTRIES = [0, 1, 3, 4]
+"""Where fx, fy, cx, cy stand in the vector of a ``gtsam.Cal3_S2``; entry 2 is the skew."""
+
 
 def to_factor_graph(
     problem: Problem, state: State, stack_by: dict[str, str] | None = None
@@ -63,8 +66,17 @@ def _stacks(batch: FactorBatch, group: str | None) -> list[IntArray]:
     return np.split(order, np.flatnonzero(np.diff(of_row[order])) + 1) if len(order) else []
 
 
-def make_custom_factor(batch: FactorBatch, state: State, free: dict[str, BoolArray]) -> gtsam.CustomFactor | None:
-    """Stack all rows of a batch into one custom factor; None when it reads no free variable."""
+def make_custom_factor(
+    batch: FactorBatch, state: State, free: dict[str, BoolArray], *, calibrations: bool = False
+) -> gtsam.CustomFactor | None:
+    """Stack all rows of a batch into one custom factor; None when it reads no free variable.
+
+    Args:
+        batch: Rows to stack.
+        state: Values of the frozen variables, and the names of all.
+        free: Per group the rows (n,) that may move.
+        calibrations: Whether intrinsics are ``gtsam.Cal3_S2`` in the values rather than 4-vectors.
+    """
     variables: dict[int, tuple[str, int]] = {}
     for slot in batch.slots:
         if slot.group in free:
@@ -76,7 +88,8 @@ def make_custom_factor(batch: FactorBatch, state: State, free: dict[str, BoolArr
     position = {variable: i for i, variable in enumerate(variables.values())}
     dimension = len(batch) * batch.family.residual_dim
     noise = gtsam.noiseModel.Unit.Create(dimension)
-    return gtsam.CustomFactor(noise, keys, _callback(batch, state, keys, list(variables.values()), position))
+    callback = _callback(batch, state, keys, list(variables.values()), position, calibrations)
+    return gtsam.CustomFactor(noise, keys, callback)
 
 
 def _callback(
@@ -85,6 +98,7 @@ def _callback(
     keys: list[int],
     variables: list[tuple[str, int]],
     position: dict[tuple[str, int], int],
+    calibrations: bool,
 ) -> Callable[[Any, gtsam.Values, list[FloatArray] | None], FloatArray]:
     slot_rows = [np.unique(s.rows, return_inverse=True) for s in batch.slots]
     constants = [state[s.group][unique] for s, (unique, _) in zip(batch.slots, slot_rows, strict=True)]
@@ -95,7 +109,11 @@ def _callback(
             current = constant.copy()
             for i, row in enumerate(unique.tolist()):
                 if (slot.group, row) in position:
-                    current[i] = values_at(values, keys[position[slot.group, row]], slot.group)
+                    key = keys[position[slot.group, row]]
+                    if calibrations and slot.group == "intrinsics":
+                        current[i] = values.atCal3_S2(key).vector()[CALIBRATION_ENTRIES]
+                    else:
+                        current[i] = values_at(values, key, slot.group)
             arguments.append(current[inverse])
         if jacobians is None:
             r, _ = _robust_square_root(batch, batch.family.residual(*arguments, **batch.data), [])
@@ -105,11 +123,16 @@ def _callback(
             r, blocks = _robust_square_root(batch, r, blocks)
             rows, d = r.shape
             for i, (group, _) in enumerate(variables):
-                jacobians[i] = np.zeros((rows * d, TANGENT_DIM[group]), order="F")
+                width = 5 if calibrations and group == "intrinsics" else TANGENT_DIM[group]
+                jacobians[i] = np.zeros((rows * d, width), order="F")
             for slot, block in zip(batch.slots, blocks, strict=True):
                 for n, row in enumerate(slot.rows.tolist()):
                     if (slot.group, row) in position:
-                        jacobians[position[slot.group, row]][n * d : (n + 1) * d] += block[n]
+                        target = jacobians[position[slot.group, row]][n * d : (n + 1) * d]
+                        if calibrations and slot.group == "intrinsics":
+                            target[:, CALIBRATION_ENTRIES] += block[n]
+                        else:
+                            target += block[n]
         return r.reshape(-1)
 
     return error

@@ -70,7 +70,7 @@ def make_objective(
     if backend.name == "gtsam":
         from uni4d_fg.solve.gtsam_objective import GtsamObjective
 
-        return GtsamObjective(problem, state, eliminate)
+        return GtsamObjective(problem, state)
     compiled = None
     if backend.name == "cpp":
         compiled = _compiled_objective(problem, state, config, eliminate, linear_solver)
