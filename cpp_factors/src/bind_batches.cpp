@@ -1,5 +1,5 @@
 // Python entry points of the batch kernels: <family>_residual, <family>_linearize, whiten and robust_energy.
-#include <nanobind/stl/string.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/vector.h>
 
 #include <memory>
@@ -15,8 +15,11 @@ namespace {
 
 constexpr int kGrain = 2000;
 
+using FloatArray = nb::ndarray<nb::numpy, double>;
+using Linearized = std::pair<FloatArray, std::vector<FloatArray>>;
+
 /// Check the arguments of a family, run a kernel over them and return the residual and, if asked, the Jacobians.
-std::pair<nb::object, nb::list> run(const BatchFamily& family, const std::vector<AnyArray>& values, bool linearize,
+Linearized run(const BatchFamily& family, const std::vector<AnyArray>& values, bool linearize,
                                     int threads) {
   const double* in[kMaxArguments] = {};
   std::int64_t rows = kAnyLength;
@@ -48,9 +51,9 @@ std::pair<nb::object, nb::list> run(const BatchFamily& family, const std::vector
     const BatchKernel kernel = linearize ? family.linearize : family.residual;
     parallel_for(count, workers, [&](int begin, int end, int) { kernel(in, out, begin, end); });
   }
-  nb::list jacobians;
-  for (std::size_t i = 1; i < results.size(); ++i) jacobians.append(nb::cast(results[i].release()));
-  return {nb::cast(results[0].release()), jacobians};
+  std::vector<FloatArray> jacobians;
+  for (std::size_t i = 1; i < results.size(); ++i) jacobians.push_back(results[i].release());
+  return {results[0].release(), jacobians};
 }
 
 template <std::size_t>
@@ -72,8 +75,7 @@ void bind_family(nb::module_& module, const BatchFamily& family, std::index_sequ
   module.def(
       (name + "_linearize").c_str(),
       [f](Array<V>... variable, Array<D>... data, int threads) {
-        auto [residual, jacobians] = run(*f, {variable..., data...}, true, threads);
-        return nb::make_tuple(residual, jacobians);
+        return run(*f, {variable..., data...}, true, threads);
       },
       nb::arg(family.arguments[V].name)..., nb::kw_only(), nb::arg(family.arguments[variables + D].name)...,
       nb::arg("threads") = 0, (text + " Returns the residuals (N, d) and the Jacobians (N, d, dim).").c_str());
@@ -110,7 +112,7 @@ double whiten_row(const double* r, const Noise& noise, long n, int dim, double* 
   return squared;
 }
 
-nb::tuple whiten_batch(const AnyArray& residual, const std::vector<AnyArray>& jacobians, const AnyArray& sigma,
+Linearized whiten_batch(const AnyArray& residual, const std::vector<AnyArray>& jacobians, const AnyArray& sigma,
                  const AnyArray& weight, int kernel, double threshold, int threads) {
   const View<double> r = expect_floats(residual, "residual", {kAnyLength, kAnyLength});
   const int count = expect_count(r.rows(), "residual");
@@ -146,9 +148,9 @@ nb::tuple whiten_batch(const AnyArray& residual, const std::vector<AnyArray>& ja
       }
     });
   }
-  nb::list scaled;
-  for (std::size_t b = 1; b < results.size(); ++b) scaled.append(nb::cast(results[b].release()));
-  return nb::make_tuple(nb::cast(results[0].release()), scaled);
+  std::vector<FloatArray> scaled;
+  for (std::size_t b = 1; b < results.size(); ++b) scaled.push_back(results[b].release());
+  return {results[0].release(), scaled};
 }
 
 double robust_energy(const AnyArray& residual, const AnyArray& sigma, const AnyArray& weight, int kernel,

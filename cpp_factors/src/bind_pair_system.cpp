@@ -1,5 +1,5 @@
 // Python face of PairSystem.
-#include <memory>
+#include <nanobind/stl/pair.h>
 
 #include "arrays.hpp"
 #include "pair_system.hpp"
@@ -85,7 +85,7 @@ void bind_pair_system(nb::module_& module) {
               nb::gil_scoped_release release;
               self.linearize(pose_data, intrinsics_data, hessian.data(), gradient.data());
             }
-            return nb::make_tuple(hessian.release(), gradient.release());
+            return std::pair(hessian.release(), gradient.release());
           },
           nb::arg("poses"), nb::arg("intrinsics"),
           "Return the Hessian J^T J (size, size) and the gradient J^T r (size,), kernels applied (IRLS).");

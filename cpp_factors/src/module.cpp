@@ -11,6 +11,8 @@ void bind_trajectory_system(nb::module_& module);
 
 NB_MODULE(_core, module) {
   module.doc() = "C++ factors and linear solvers for uni4d_fg.";
+  // Objects that outlive the interpreter's own clean-up (in a failed test, say) are no reason to print.
+  nb::set_leak_warnings(false);
   // Raised by every change of a signature or of a meaning.
   module.attr("ABI") = 1;
   uni4d_fg::bind_batches(module);

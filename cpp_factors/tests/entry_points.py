@@ -45,3 +45,29 @@ ENTRY_POINTS["whiten"] = EntryPoint(
     lambda rng: {"residual": rng.normal(size=(5, 3)), "jacobians": rng.normal(size=(5, 3, 6)), **_noise(rng, 5)},
     ("sigma", "weight"),
 )
+
+
+def _pairs(rng: np.random.Generator) -> dict[str, Any]:
+    return {
+        "source": np.array([0, 0, 1, 2, 2]),
+        "target": np.array([1, 2, 0, 0, 1]),
+        "uv_source": rng.uniform(0, 600, (5, 2)),
+        "depth": rng.uniform(1, 5, 5),
+        "uv_target": rng.uniform(0, 600, (5, 2)),
+        **_noise(rng, 5),
+        "pose_columns": np.arange(18).reshape(3, 6),
+        "intrinsics_columns": np.array([18, 19, -1, -1]),
+    }
+
+
+def _state_of_pairs(rng: np.random.Generator) -> dict[str, Any]:
+    return {"poses": arguments_of("camera_rotation", rng, 3)["now"], "intrinsics": rng.uniform(200, 900, 4)}
+
+
+_PAIR_SYSTEM = _core.PairSystem(**_pairs(np.random.default_rng(0)), size=20)
+
+ENTRY_POINTS["PairSystem"] = EntryPoint(
+    lambda **arguments: _core.PairSystem(**arguments, size=20), _pairs, ("sigma", "weight")
+)
+ENTRY_POINTS["PairSystem.energy"] = EntryPoint(_PAIR_SYSTEM.energy, _state_of_pairs)
+ENTRY_POINTS["PairSystem.linearize"] = EntryPoint(_PAIR_SYSTEM.linearize, _state_of_pairs)
