@@ -1,6 +1,6 @@
 """Bundle adjustment side by side: this package with and without C++, GTSAM and Ceres.
 
-    python benchmarks/bundle_adjustment.py [--sizes 60000 350000 1000000] [--repeats 3] [--threads 2] [--solvers cpp ...]
+    python benchmarks/bundle_adjustment.py [--sizes 60000 350000] [--repeats 3] [--threads 2] [--solvers cpp gtsam]
 
 Every solver gets the same synthetic problem and the same start, in a process of its own so that its peak memory
 is its own: tracks of 20 to 50 consecutive frames, pixel noise of 1 px with 3 % outliers, shared fx, fy, cx, cy,
@@ -259,7 +259,10 @@ def table(size: int, results: dict[str, dict[str, Any]]) -> None:
         f"\n{any_result['observations']} observations, {any_result['landmarks']} landmarks, "
         f"{any_result['frames']} frames; cost {lowest:.6g}\n"
     )
-    print("| solver | total, s | ratio | s / iteration | ratio | iterations | set up | linearise | solve | evaluate |", end="")
+    print(
+        "| solver | total, s | ratio | s / iteration | ratio | iterations | set up | linearise | solve | evaluate |",
+        end="",
+    )
     print(" peak memory, MB | of which solver | cost above lowest |\n|---|" + "---|" * 12)
     for name, r in results.items():
         phases = " | ".join(f"{r[phase]:.3f}" if phase in r else "" for phase in ("linearize", "solve", "evaluate"))

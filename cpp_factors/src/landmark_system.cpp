@@ -78,7 +78,7 @@ LandmarkSystem::LandmarkSystem(LandmarkProblem problem, int threads)
   problem_.reprojection.clear();
   problem_.depth.clear();
   coupling_.resize(static_cast<std::size_t>(plan_.num_pairs) * kWidth);
-  landmarks_.resize(static_cast<std::size_t>(problem_.num_landmarks) * kWidth);
+  landmarks_.assign(static_cast<std::size_t>(problem_.num_landmarks) * kWidth, 0.0);
   factors_.resize(static_cast<std::size_t>(problem_.num_landmarks) * 6);
   const auto count = static_cast<std::size_t>(workers());
   const auto frames = static_cast<std::size_t>(problem_.num_frames);

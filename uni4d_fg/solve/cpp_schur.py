@@ -134,8 +134,9 @@ class CppSchurObjective:
         """
         *arrays, landmark_gradient, finite = self._system.linearize(*self._arguments(state))
         if not finite:
-            for batch in self._batches:
-                batch.linearize(state)  # names the offending factor
+            with np.errstate(all="ignore"):
+                for batch in self._batches:
+                    batch.linearize(state)  # names the offending factor
         system = CameraSystem(*arrays)
         self._terms.add_to(system, state)
         return CppSchurLinearization(self, system, landmark_gradient)

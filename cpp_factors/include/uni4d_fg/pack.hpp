@@ -5,7 +5,12 @@
 #include <cstddef>
 #include <cstring>
 #include <new>
+#include <utility>
 #include <vector>
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 #include "uni4d_fg/math.hpp"
 
@@ -98,15 +103,30 @@ UNI4D_FG_INLINE double sum(const Pack& a) {
   return ((a[0] + a[1]) + (a[2] + a[3])) + ((a[4] + a[5]) + (a[6] + a[7]));
 }
 
-/// Memory aligned for packs.
+/// Memory aligned for packs, in large pages where it is large; values are left as they are unless given.
 template <typename T>
 struct PackAllocator {
   using value_type = T;
   PackAllocator() = default;
   template <typename U>
   PackAllocator(const PackAllocator<U>&) {}
-  T* allocate(std::size_t n) { return static_cast<T*>(::operator new(n * sizeof(T), std::align_val_t(64))); }
-  void deallocate(T* p, std::size_t) { ::operator delete(p, std::align_val_t(64)); }
+  T* allocate(std::size_t n) {
+    void* p = ::operator new(n * sizeof(T), alignment(n));
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+    // A refusal changes nothing but speed.
+    if (alignment(n) == kLargePage) (void)madvise(p, n * sizeof(T), MADV_HUGEPAGE);
+#endif
+    return static_cast<T*>(p);
+  }
+  void deallocate(T* p, std::size_t n) { ::operator delete(p, alignment(n)); }
+  template <typename U>
+  void construct(U* p) {
+    ::new (static_cast<void*>(p)) U;
+  }
+  template <typename U, typename... Arguments>
+  void construct(U* p, Arguments&&... arguments) {
+    ::new (static_cast<void*>(p)) U(std::forward<Arguments>(arguments)...);
+  }
   template <typename U>
   bool operator==(const PackAllocator<U>&) const {
     return true;
@@ -114,6 +134,12 @@ struct PackAllocator {
   template <typename U>
   bool operator!=(const PackAllocator<U>&) const {
     return false;
+  }
+
+ private:
+  static constexpr std::align_val_t kLargePage{std::size_t{2} << 20};
+  static std::align_val_t alignment(std::size_t n) {
+    return n * sizeof(T) >= 4 * static_cast<std::size_t>(kLargePage) ? kLargePage : std::align_val_t(64);
   }
 };
 
