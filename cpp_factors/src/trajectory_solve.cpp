@@ -286,7 +286,7 @@ class TrajectorySystem::ConjugateGradients {
 
 void TrajectorySystem::multiply(const double* vector, double* result) const {
   ConjugateGradients work(*this);
-  Team::run(threads_, [&](int worker, Team& team) { work.multiply(vector, nullptr, result, worker, team); });
+  Team::run(useful_threads(threads_, num_chunks_, 2), [&](int worker, Team& team) { work.multiply(vector, nullptr, result, worker, team); });
 }
 
 std::optional<TrajectoryStep> TrajectorySystem::solve(double damping, double min_diagonal, double max_diagonal,
@@ -294,7 +294,7 @@ std::optional<TrajectoryStep> TrajectorySystem::solve(double damping, double min
   ConjugateGradients work(*this);
   std::atomic<bool> positive{true};
   TrajectoryStep step;
-  Team::run(std::min(threads_, std::max(num_chunks_, 1)), [&](int worker, Team& team) {
+  Team::run(useful_threads(threads_, num_chunks_, 2), [&](int worker, Team& team) {
     const int end = range_begin(num_chunks_, team.size(), worker + 1);
     for (int chunk = range_begin(num_chunks_, team.size(), worker); chunk < end; ++chunk) {
       if (!factorize_chunk(chunk, damping, min_diagonal, max_diagonal)) positive = false;

@@ -14,6 +14,8 @@ namespace uni4d_fg {
 namespace {
 
 constexpr int kRangeSize = 4096;
+/// Ranges, or chunks of tracks, that are worth a thread.
+constexpr int kRangeGrain = 2;
 /// Places of the entries of a symmetric 3x3 block in its six stored values.
 constexpr int kRowOf[6] = {0, 0, 0, 1, 1, 2};
 constexpr int kColumnOf[6] = {0, 1, 2, 1, 2, 2};
@@ -50,7 +52,7 @@ int num_ranges(std::size_t count) { return static_cast<int>((count + kRangeSize 
 
 std::vector<double> TrajectorySystem::energies(const double* points) const {
   const int edge_ranges = num_ranges(edge_low_.size());
-  parallel_for(edge_ranges, threads_, [&](int begin, int end, int) {
+  parallel_for(edge_ranges, useful_threads(threads_, edge_ranges, kRangeGrain), [&](int begin, int end, int) {
     const std::size_t stop = std::min(edge_low_.size(), static_cast<std::size_t>(end) * kRangeSize);
     for (std::size_t e = static_cast<std::size_t>(begin) * kRangeSize; e < stop; ++e) {
       distance_[e] = arap::smooth_distance(load_vec3(points + 3 * edge_low_[e]) - load_vec3(points + 3 * edge_high_[e]));
@@ -60,7 +62,7 @@ std::vector<double> TrajectorySystem::energies(const double* points) const {
   std::vector<std::int32_t> first_range(1, 0);
   for (const Batch& batch : batches_) first_range.push_back(first_range.back() + num_ranges(batch.weight.size()));
   std::vector<double> sums(static_cast<std::size_t>(first_range.back()));
-  parallel_for(first_range.back(), threads_, [&](int begin, int end, int) {
+  parallel_for(first_range.back(), useful_threads(threads_, first_range.back(), kRangeGrain), [&](int begin, int end, int) {
     for (int range = begin; range < end; ++range) {
       const auto index = static_cast<std::size_t>(
           std::upper_bound(first_range.begin(), first_range.end(), range) - first_range.begin() - 1);
@@ -122,7 +124,7 @@ NonFinite TrajectorySystem::linearize(const double* points) {
   linearize_edges(points);
   linearize_arap(bad);
   sum_over_edges();
-  parallel_for(num_chunks_, threads_, [&](int begin, int end, int worker) {
+  parallel_for(num_chunks_, useful_threads(threads_, num_chunks_, kRangeGrain), [&](int begin, int end, int worker) {
     for (int chunk = begin; chunk < end; ++chunk) {
       for (std::size_t b = 0; b < batches_.size(); ++b) {
         if (batches_[b].kind != Kind::kArap) {
@@ -145,7 +147,8 @@ NonFinite TrajectorySystem::linearize(const double* points) {
 
 /// Evaluate the distance of every edge and its derivative with respect to the lower row.
 void TrajectorySystem::linearize_edges(const double* points) {
-  parallel_for(num_ranges(edge_low_.size()), threads_, [&](int begin, int end, int) {
+  const int ranges = num_ranges(edge_low_.size());
+  parallel_for(ranges, useful_threads(threads_, ranges, kRangeGrain), [&](int begin, int end, int) {
     const std::size_t stop = std::min(edge_low_.size(), static_cast<std::size_t>(end) * kRangeSize);
     for (std::size_t e = static_cast<std::size_t>(begin) * kRangeSize; e < stop; ++e) {
       const Vec3 difference = load_vec3(points + 3 * edge_low_[e]) - load_vec3(points + 3 * edge_high_[e]);
@@ -160,7 +163,7 @@ void TrajectorySystem::linearize_arap(std::vector<NonFinite>& bad) {
   for (std::size_t b = 0; b < batches_.size(); ++b) {
     const Batch& batch = batches_[b];
     if (batch.kind != Kind::kArap) continue;
-    parallel_for(batch.size(), threads_, [&](int begin, int end, int worker) {
+    parallel_for(batch.size(), useful_threads(threads_, batch.size(), kRangeGrain * kRangeSize), [&](int begin, int end, int worker) {
       for (int i = begin; i < end; ++i) {
         const auto n = static_cast<std::size_t>(i), f = n + static_cast<std::size_t>(batch.first_factor);
         const double r = distance_[static_cast<std::size_t>(factor_now_[f])] -
@@ -177,7 +180,8 @@ void TrajectorySystem::linearize_arap(std::vector<NonFinite>& bad) {
 
 /// Sum the weights and forces of the factors that use each distance.
 void TrajectorySystem::sum_over_edges() {
-  parallel_for(num_ranges(edge_low_.size()), threads_, [&](int begin, int end, int) {
+  const int ranges = num_ranges(edge_low_.size());
+  parallel_for(ranges, useful_threads(threads_, ranges, kRangeGrain), [&](int begin, int end, int) {
     const std::size_t stop = std::min(edge_low_.size(), static_cast<std::size_t>(end) * kRangeSize);
     for (std::size_t e = static_cast<std::size_t>(begin) * kRangeSize; e < stop; ++e) {
       double stiffness = 0.0, diagonal = 0.0, force = 0.0;

@@ -1,0 +1,288 @@
+"""Moving points side by side: this package with and without C++, and GTSAM's linear solvers.
+
+    python benchmarks/nonrigid.py [--sizes 400x50x6 1500x50x4] [--growth 25 50 100 200] [--solvers cpp python ...]
+                                  [--repeats 3] [--cholesky]
+
+Every solver gets the same problem (tracks x frames x neighbours: two bodies that turn, drift and breathe, pixels of
+0.5 px with 2 % outliers, depth of 2 %, 10 % of the observations missing; the default energy) and the same start, in a
+process of its own so that its peak memory is its own. All run under the one Levenberg-Marquardt driver with the same
+damping, and stop when a step lowers the cost by less than 1e-4 of it. Printed are the fastest of the repeats.
+
+    cpp          trajectories in C++; 'set up' is planning
+    python       the same method with NumPy and SciPy
+    gtsam-pcg    the same damped systems solved by GTSAM's conjugate gradients with its block-Jacobi preconditioner, to
+                 the same relative tolerance; its Python interface does not tell the number of steps
+    gtsam-metis  the same systems by GTSAM's elimination in METIS order; one linear solve only, and its cost is the
+                 one after that step
+
+For GTSAM, 'solve' is the time inside GTSAM alone: making its factors from Python is not counted, and linearisation
+and evaluation are those of 'python'.
+
+`--growth` solves 400 tracks x 6 neighbours with these numbers of frames and prints the exponent of the growth.
+`--cholesky` times what conjugate gradients replace: a banded Cholesky over time, points ordered by frame. A frame of M
+tracks is a block of 3 M, second differences couple it with two others, so that the band has 6 M rows below the
+diagonal: (3 M T) (6 M)^2 = 108 M^3 T flop for T frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from typing import Any
+
+import gtsam
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.config.stages import NonRigidConfig
+from uni4d_fg.factors.custom_factor import to_factor_graph
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.graph.problem import Problem
+from uni4d_fg.graph.state import State
+from uni4d_fg.solve.levenberg_marquardt import minimize
+from uni4d_fg.solve.objective import Step
+from uni4d_fg.solve.trajectory_cg import TrajectoryLinearization, TrajectoryObjective
+from uni4d_fg.stages.bundle_adjustment import StaticNoise
+from uni4d_fg.stages.nonrigid import FrozenCameras, build_mesh, nonrigid_stage
+from uni4d_fg.stages.observations import Observations
+
+SOLVERS = ("cpp", "python", "gtsam-pcg", "gtsam-metis")
+SOLVER = SolverConfig(max_iterations=30, relative_decrease=1e-4)
+K = np.array([300.0, 300.0, 160.0, 120.0])
+
+
+def make_problem(tracks: int, frames: int, neighbours: int, seed: int = 0) -> tuple[Problem, State]:
+    """Return stage 3 of two moving bodies, all points free."""
+    rng = np.random.default_rng(seed)
+    t, zero = np.arange(frames), np.zeros(frames)
+    poses = se3.se3_exp(
+        np.stack([0.002 * np.sin(t), 0.03 * np.sin(0.1 * t), zero, 0.3 * np.sin(0.07 * t), zero, zero], axis=1)
+    )
+    instance = np.arange(tracks) % 2
+    body = rng.uniform(-1, 1, size=(tracks, 3)) * np.array([0.4, 0.5, 0.15])
+    points = np.empty((tracks, frames, 3))
+    for label, side in ((0, -1.0), (1, 1.0)):
+        mine = instance == label
+        motion = se3.se3_exp(np.stack([zero, 0.03 * side * t, 0.01 * t, zero, zero, zero], axis=1))
+        breath = (1.0 + 0.1 * np.sin(0.2 * t + label))[None, :, None]
+        drift = np.stack([0.2 * np.sin(0.05 * t), 0.05 * np.sin(0.3 * t), 0.1 * np.sin(0.08 * t)], axis=1)
+        points[mine] = np.einsum("tij,mtj->mti", motion[:, :3, :3], body[mine][:, None] * breath) + drift
+        points[mine] += np.array([0.9 * side, 0.0, 3.0])
+    x = world_to_camera(np.broadcast_to(poses, (tracks, frames, 4, 4)), points)
+    uv = project(K, x) + rng.normal(scale=0.5, size=(tracks, frames, 2))
+    wrong = rng.random((tracks, frames)) < 0.02
+    uv[wrong] += rng.normal(scale=8.0, size=(int(wrong.sum()), 2))
+    depth = x[..., 2] * np.exp(rng.normal(scale=0.02, size=(tracks, frames)))
+    k, f = np.nonzero(rng.random((tracks, frames)) >= 0.1)
+    seen = Observations(k, f, uv[k, f], depth[k, f], np.ones(len(k)))
+    config = NonRigidConfig(neighbours=neighbours)
+    cameras = FrozenCameras(poses, K, np.zeros(frames), StaticNoise(0.5, 0.02))
+    mesh, seen, rows, state = build_mesh(seen, instance, frames, cameras, config, {})
+    stage = nonrigid_stage(state, mesh, seen, rows, cameras, config, unsquared=False, normalization="mean")
+    return stage.problem, state
+
+
+class GtsamSystems(TrajectoryObjective):
+    """NumPy's linearisation with GTSAM's linear solvers."""
+
+    def __init__(self, problem: Problem, state: State, config: SolverConfig, method: str):
+        super().__init__(problem, state, config)
+        self.method, self.seconds, self.linearize_seconds = method, 0.0, 0.0
+        self.graph = to_factor_graph(problem, state)
+        self.keys = [state.key("dynamic_point", row) for row in range(len(state["dynamic_point"]))]
+
+    def linearize(self, state: State) -> Any:
+        """Return NumPy's model and GTSAM's factors."""
+        began = time.perf_counter()
+        ours = super().linearize(state)
+        self.linearize_seconds += time.perf_counter() - began
+        return GtsamSystem(self, ours, self.graph.linearize(state.to_values()))
+
+
+class GtsamSystem:
+    """One quadratic model as Gaussian factors."""
+
+    def __init__(self, objective: GtsamSystems, ours: TrajectoryLinearization, factors: gtsam.GaussianFactorGraph):
+        self.objective, self.ours, self.factors = objective, ours, factors
+        self.gradient_max = ours.gradient_max
+
+    def solve(self, damping: float) -> Step:
+        """Solve the damped system; the time spent outside GTSAM is not counted."""
+        objective, config = self.objective, self.objective.config
+        graph = gtsam.GaussianFactorGraph()
+        graph.push_back(self.factors)
+        added = np.sqrt(damping * np.clip(self.ours.bands[0], config.min_diagonal, config.max_diagonal)).reshape(-1, 3)
+        unit = gtsam.noiseModel.Unit.Create(3)
+        for key, diagonal in zip(objective.keys, added, strict=True):
+            graph.push_back(gtsam.JacobianFactor(key, np.diag(diagonal), np.zeros(3), unit))
+        solve = _metis if objective.method == "gtsam-metis" else _conjugate_gradients
+        delta, seconds = solve(graph, objective.keys, config)
+        objective.seconds += seconds
+        curvature = float(delta @ self.ours.multiply(delta))
+        decrease = -float(self.ours.gradient @ delta) - 0.5 * curvature
+        return Step(delta, float(np.linalg.norm(delta)), max(decrease, 0.0))
+
+
+def _metis(graph: gtsam.GaussianFactorGraph, keys: list[int], config: SolverConfig) -> tuple[np.ndarray, float]:
+    """Return the exact solution and GTSAM's seconds."""
+    began = time.perf_counter()
+    solution = graph.optimize(gtsam.Ordering.MetisGaussianFactorGraph(graph))
+    seconds = time.perf_counter() - began
+    return np.asarray(solution.vector(keys)), seconds
+
+
+def _conjugate_gradients(
+    graph: gtsam.GaussianFactorGraph, keys: list[int], config: SolverConfig
+) -> tuple[np.ndarray, float]:
+    """Return the solution and GTSAM's seconds: one Gauss-Newton step on the graph as it is."""
+    values = gtsam.Values()
+    for key in keys:
+        values.insert(key, np.zeros(3))
+    linear = gtsam.LinearContainerFactor.ConvertLinearGraph(graph, values)
+    inner = gtsam.PCGSolverParameters(gtsam.BlockJacobiPreconditionerParameters())
+    inner.epsilon_rel, inner.epsilon_abs, inner.maxIterations = config.cg_tolerance, 1e-30, config.cg_max_iterations
+    parameters = gtsam.GaussNewtonParams()
+    parameters.setMaxIterations(1)
+    parameters.setLinearSolverType("ITERATIVE")
+    parameters.setIterativeParams(inner)
+    optimizer = gtsam.GaussNewtonOptimizer(linear, values, parameters)
+    began = time.perf_counter()
+    solution = optimizer.optimize()
+    seconds = time.perf_counter() - began
+    return np.concatenate([solution.atPoint3(key) for key in keys]), seconds
+
+
+def run(solver: str, size: str) -> dict[str, Any]:
+    """Solve one problem with one solver in this process."""
+    problem, state = make_problem(*map(int, size.split("x")))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    config = SOLVER.model_copy(update={"max_iterations": 1}) if solver == "gtsam-metis" else SOLVER
+    began = time.perf_counter()
+    if solver == "cpp":
+        from uni4d_fg.solve.cpp_trajectory import CppTrajectoryObjective
+
+        objective: Any = CppTrajectoryObjective(problem, state, config)
+    elif solver == "python":
+        objective = TrajectoryObjective(problem, state, config)
+    else:
+        objective = GtsamSystems(problem, state, config, solver)
+    planned = time.perf_counter() - began
+    _, summary = minimize(objective, state, config)
+    seconds = {"set up": planned, **{phase: summary.seconds[phase] for phase in ("linearize", "solve", "evaluate")}}
+    if solver.startswith("gtsam"):
+        # Linearisation and evaluation stand beside GTSAM's solver as they are with NumPy.
+        seconds = {**seconds, "set up": 0.0, "solve": objective.seconds, "linearize": objective.linearize_seconds}
+    return {
+        "cost": summary.final_energy,
+        "iterations": len(summary.iterations),
+        "inner": sum(record.inner_iterations for record in summary.iterations),
+        "seconds": seconds,
+        "total": sum(seconds.values()),
+        "points": len(state["dynamic_point"]),
+        "factors": sum(len(batch) for batch in problem.batches),
+        "memory": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024,
+    }
+
+
+def measured(solver: str, size: str, repeats: int) -> dict[str, Any]:
+    """Return the fastest of the repeats, each in a process of its own."""
+    command = [sys.executable, __file__, "--one", solver, size]
+    results = []
+    for _ in range(1 if solver.startswith("gtsam") else repeats):
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        results.append(json.loads(done.stdout.splitlines()[-1]))
+    return min(results, key=lambda result: float(result["total"]))
+
+
+def table(size: str, solvers: list[str], repeats: int) -> None:
+    """Print one size, all solvers."""
+    rows: dict[str, dict[str, Any]] = {}
+    for solver in solvers:
+        rows[solver] = measured(solver, size, repeats)
+    first = rows[solvers[0]]
+    print(f"\n### {size}: {first['points']} points, {first['factors']} factors\n")
+    phases = ("set up", "linearize", "solve", "evaluate")
+    columns = ("solver", "final cost", "iterations", "inner steps", *(f"{p}, s" for p in phases), "total, s")
+    print("| " + " | ".join((*columns, "added memory, MB", f"total / {solvers[0]}")) + " |")
+    print("|---" * (len(columns) + 2) + "|")
+    for solver, row in rows.items():
+        inner = "-" if solver.startswith("gtsam") else row["inner"]
+        once = " (one linear solve)" if solver == "gtsam-metis" else ""
+        times = " | ".join(f"{row['seconds'][phase]:.3f}" for phase in phases)
+        ratio = row["total"] / first["total"]
+        print(
+            f"| {solver}{once} | {row['cost']:.2f} | {row['iterations']} | {inner} | {times} | {row['total']:.3f} | "
+            f"{row['memory']:.0f} | {ratio:.1f} |",
+            flush=True,
+        )
+
+
+def growth(frames: list[int], solvers: list[str], repeats: int) -> None:
+    """Print the time by frames, and the exponent of a power law fitted to it."""
+    print("\n### 400 tracks x 6 neighbours, by frames: total, s\n")
+    print("| solver | " + " | ".join(map(str, frames)) + " | exponent |")
+    print("|---" * (len(frames) + 2) + "|")
+    for solver in solvers:
+        times = [measured(solver, f"400x{n}x6", repeats)["total"] for n in frames]
+        exponent = np.polyfit(np.log(frames), np.log(times), 1)[0]
+        print(f"| {solver} | " + " | ".join(f"{t:.3f}" for t in times) + f" | {exponent:.2f} |", flush=True)
+
+
+def cholesky(sizes: list[str]) -> None:
+    """Time one banded Cholesky of the normal equations with points ordered by frame."""
+    print("\n### Banded Cholesky over time, one factorisation\n")
+    print("| size | rows | band | s | GFlop/s | 400x50 at that rate, s |\n|---|---|---|---|---|---|")
+    for size in sizes:
+        problem, state = make_problem(*map(int, size.split("x")))
+        linearization = TrajectoryObjective(problem, state, SOLVER).linearize(state)
+        jacobian = linearization._jacobian
+        hessian = (jacobian.T @ jacobian + linearization._inside).tocoo()
+        names = state.names.dynamic_track_frame
+        assert names is not None
+        place = np.empty(len(names), dtype=np.int64)
+        place[np.lexsort((names[:, 0], names[:, 1]))] = np.arange(len(names))
+        row, column = (3 * place[index // 3] + index % 3 for index in (hessian.row, hessian.col))
+        width, n = int(np.abs(row - column).max()), hessian.shape[0]
+        band = np.zeros((width + 1, n), order="F")
+        lower = row >= column
+        np.add.at(band, (row[lower] - column[lower], column[lower]), hessian.data[lower])
+        band[0] *= 1.0 + SOLVER.initial_damping
+        began = time.perf_counter()
+        _, failed = scipy.linalg.lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+        seconds = time.perf_counter() - began
+        assert not failed
+        rate = n * float(width) ** 2 / seconds
+        full = 108.0 * 400.0**3 * 50.0 / rate
+        print(f"| {size} | {n} | {width} | {seconds:.2f} | {rate / 1e9:.1f} | {full:.1f} |", flush=True)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", nargs="*", default=["400x50x6", "1500x50x4"])
+    parser.add_argument("--growth", type=int, nargs="*", default=[25, 50, 100, 200])
+    parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=list(SOLVERS))
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--cholesky", action="store_true")
+    parser.add_argument("--one", nargs=2, metavar=("SOLVER", "SIZE"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(run(*arguments.one)))
+        return
+    for size in arguments.sizes:
+        table(size, arguments.solvers, arguments.repeats)
+    if arguments.growth:
+        growth(arguments.growth, [s for s in arguments.solvers if not s.startswith("gtsam")], arguments.repeats)
+    if arguments.cholesky:
+        cholesky(["50x50x6", "100x50x6", "200x50x6"])
+
+
+if __name__ == "__main__":
+    main()
