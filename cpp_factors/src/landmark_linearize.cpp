@@ -74,18 +74,32 @@ UNI4D_FG_INLINE void add(double* sums, int place, const Pack& value) {
   store_pack(load_pack(at) + value, at);
 }
 
-/// Hand out what eight records computed, (48, 8): the first 24 rows to their pairs, the others to their landmarks.
-UNI4D_FG_INLINE void scatter_group(const RecordGroup& group, const std::uint8_t* lane_landmark, const int* lane_pair,
-                                   const double* out, double* coupling, double* by_landmark) {
-  for (int lane = 0; lane < group.used; ++lane) {
-    double* pair = coupling + static_cast<std::size_t>(lane_pair[lane]) * kWidth;
-    double* landmark = by_landmark + static_cast<std::size_t>(lane_landmark[lane]) * kWidth;
-    const double* from = out + lane;
-    if (group.first)
-      for (int q = 0; q < kWidth; ++q) pair[q] = from[q * kPackLanes];
-    else
-      for (int q = 0; q < kWidth; ++q) pair[q] += from[q * kPackLanes];
-    for (int q = 0; q < kWidth; ++q) landmark[q] += from[(kWidth + q) * kPackLanes];
+/// Where eight records put what they computed.
+struct Lanes {
+  const RecordGroup& group;
+  const std::uint8_t* landmark;
+  const int* pair;
+};
+
+/// Hand row `row` (8 columns, a lane per record) of the coupling blocks to their pairs.
+UNI4D_FG_INLINE void store_coupling(const Lanes& lanes, const Pack* columns, int row, double* coupling) {
+  Pack records[kPackLanes];
+  transpose(columns, records);
+  for (int lane = 0; lane < kPackLanes; ++lane) {
+    if (lane >= lanes.group.used) break;
+    double* at = coupling + static_cast<std::size_t>(lanes.pair[lane]) * kWidth + row * kPackLanes;
+    store_pack(lanes.group.first ? records[lane] : load_pack(at) + records[lane], at);
+  }
+}
+
+/// Add eight sums at place `row` of the records' landmarks.
+UNI4D_FG_INLINE void add_to_landmarks(const Lanes& lanes, const Pack* columns, int row, double* by_landmark) {
+  Pack records[kPackLanes];
+  transpose(columns, records);
+  for (int lane = 0; lane < kPackLanes; ++lane) {
+    if (lane >= lanes.group.used) break;
+    double* at = by_landmark + static_cast<std::size_t>(lanes.landmark[lane]) * kWidth + row * kPackLanes;
+    store_pack(load_pack(at) + records[lane], at);
   }
 }
 
@@ -96,7 +110,6 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
   const ChunkPoints points(chunk, in.state.landmarks);
   const Intrinsics k = load_intrinsics(in.state.intrinsics);
   alignas(64) double by_landmark[kChunkLandmarks * kWidth] = {};
-  alignas(64) double out[2 * kWidth * kPackLanes] = {};
   const GroupArrays groups(chunk);
   for (std::size_t i = 0; i < groups.count; ++i) {
     const RecordGroup& group = groups.groups[i];
@@ -195,31 +208,36 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
       lv[j] = c * m[4 * j + 1] + d * m[4 * j + 2];
       ld[j] = e * m[4 * j + 2];
     }
+    const Lanes lanes{group, lane_landmark, groups.lane_pair + i * kPackLanes};
     for (int j = 0; j < 3; ++j) {
-      double* row = out + 8 * j * kPackLanes;
-      store_pack(plus<kDepth>(lu[j] * ju[0] + lv[j] * jv[0], ld[j], jd[0]), row);
-      store_pack(plus<kDepth>(lu[j] * ju[1] + lv[j] * jv[1], ld[j], jd[1]), row + kPackLanes);
-      store_pack(lu[j] * ju[2] + lv[j] * jv[2], row + 2 * kPackLanes);
-      store_pack(lu[j] * ju[3], row + 3 * kPackLanes);
-      store_pack(lv[j] * jv[3], row + 4 * kPackLanes);
-      store_pack(plus<kDepth>(lu[j] * ju[4] + lv[j] * jv[4], ld[j], jd[2]), row + 5 * kPackLanes);
-      if constexpr (kDepth) store_pack(ld[j] * js, row + 6 * kPackLanes);
+      Pack columns[kPackLanes] = {plus<kDepth>(lu[j] * ju[0] + lv[j] * jv[0], ld[j], jd[0]),
+                                  plus<kDepth>(lu[j] * ju[1] + lv[j] * jv[1], ld[j], jd[1]),
+                                  lu[j] * ju[2] + lv[j] * jv[2],
+                                  lu[j] * ju[3],
+                                  lv[j] * jv[3],
+                                  plus<kDepth>(lu[j] * ju[4] + lv[j] * jv[4], ld[j], jd[2]),
+                                  Pack{},
+                                  Pack{}};
+      if constexpr (kDepth) columns[6] = ld[j] * js;
+      store_coupling(lanes, columns, j, coupling);
     }
-    double* point = out + kWidth * kPackLanes;
+    // V, the gradient, and the coupling to the intrinsics: 24 sums in the order of LandmarkSystem::landmarks_.
+    Pack point[kWidth];
     int place = 0;
     for (int j = 0; j < 3; ++j)
-      for (int n = j; n < 3; ++n) store_pack(plus<kDepth>(lu[j] * lu[n] + lv[j] * lv[n], ld[j], ld[n]), point + kPackLanes * place++);
-    for (int j = 0; j < 3; ++j) store_pack(plus<kDepth>(lu[j] * ru + lv[j] * rv, ld[j], rd), point + kPackLanes * (6 + j));
+      for (int n = j; n < 3; ++n) point[place++] = plus<kDepth>(lu[j] * lu[n] + lv[j] * lv[n], ld[j], ld[n]);
+    for (int j = 0; j < 3; ++j) point[6 + j] = plus<kDepth>(lu[j] * ru + lv[j] * rv, ld[j], rd);
+    for (int j = 9; j < kWidth; ++j) point[j] = Pack{};
     if constexpr (kIntrinsics) {
       for (int j = 0; j < 3; ++j) {
-        double* row = point + (9 + 4 * j) * kPackLanes;
-        store_pack(lu[j] * jfx, row);
-        store_pack(lv[j] * jfy, row + kPackLanes);
-        store_pack(lu[j] * jcx, row + 2 * kPackLanes);
-        store_pack(lv[j] * jcy, row + 3 * kPackLanes);
+        point[9 + 4 * j] = lu[j] * jfx;
+        point[10 + 4 * j] = lv[j] * jfy;
+        point[11 + 4 * j] = lu[j] * jcx;
+        point[12 + 4 * j] = lv[j] * jcy;
       }
     }
-    scatter_group(group, lane_landmark, groups.lane_pair + i * kPackLanes, out, coupling, by_landmark);
+    for (int row = 0; row < (kIntrinsics ? 3 : 2); ++row)
+      add_to_landmarks(lanes, point + row * kPackLanes, row, by_landmark);
   }
   if (chunk.frozen) return;
   for (std::size_t i = 0; i < chunk.landmarks.size(); ++i)
