@@ -62,6 +62,24 @@ def test_reconstruction_round_trip(tmp_path: Path, landmarks: int, dynamic: int)
     assert [p.name for p in tmp_path.iterdir()] == ["reconstruction.npz"]
 
 
+def test_covariances_are_optional(tmp_path: Path) -> None:
+    path = tmp_path / "reconstruction.npz"
+    covariance = np.tile(np.eye(6), (5, 1, 1))
+    covariance[4] = np.nan
+    known = dataclasses.replace(
+        make_reconstruction(), pose_covariance=covariance, intrinsics_covariance=np.diag([1.0, 2.0, 0.0, 0.0])
+    )
+    save_reconstruction(path, known)
+    again = load_reconstruction(path)
+    np.testing.assert_array_equal(again.pose_covariance, covariance)
+    np.testing.assert_array_equal(again.intrinsics_covariance, known.intrinsics_covariance)
+    save_reconstruction(path, make_reconstruction())
+    assert "pose_covariance" not in load_npz(path, {})
+    assert load_reconstruction(path).pose_covariance is None
+    with pytest.raises(OutputError, match=r"pose_covariance has shape \(4, 6, 6\)"):
+        save_reconstruction(path, dataclasses.replace(known, pose_covariance=covariance[:4]))
+
+
 def tamper(path: Path, **changes: Any) -> None:
     save_reconstruction(path, make_reconstruction())
     arrays = load_npz(path, {})

@@ -14,7 +14,7 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.graph.state import State, VariableNames
 from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.summary import Termination
-from uni4d_fg.stages.bundle_adjustment import BundleAdjustmentResult, Freedom, _drop_outliers, adjust_bundle
+from uni4d_fg.stages.bundle_adjustment import BundleAdjustmentResult, Freedom, drop_outliers, adjust_bundle
 from uni4d_fg.stages.observations import Observations
 from uni4d_fg.tracks.model import LabelledTracks
 
@@ -85,6 +85,16 @@ def test_the_first_frame_is_the_gauge_and_stays_exactly(
     assert np.abs(result.world_T_cam[1:] - moved[1:]).max() > 1e-4
 
 
+def test_covariances_come_with_the_cameras(exact: LabelledTracks, start: np.ndarray) -> None:
+    result = adjust(static_observations(exact), start, intrinsics_free=True)
+    assert (result.pose_covariance[0] == 0.0).all()
+    assert (np.linalg.eigvalsh(result.pose_covariance[1:]) > 0.0).all()
+    assert (np.diag(result.intrinsics_covariance)[:2] > 0.0).all()
+    assert (result.intrinsics_covariance[2:] == 0.0).all()
+    paper = adjust(static_observations(exact), start, changed(depth_prior=False), unsquared=True)
+    assert np.isnan(paper.pose_covariance).all()
+
+
 def test_the_scale_of_the_depth_cue_per_frame_is_found(exact: LabelledTracks, start: np.ndarray) -> None:
     scale = np.array([0.04, -0.05, 0.02, 0.0, -0.03, 0.05, -0.02, -0.01])
     observations = static_observations(exact)
@@ -130,7 +140,7 @@ def test_observations_behind_a_camera_are_dropped_and_counted(exact: LabelledTra
     poses[5] = poses[5] @ se3.se3_exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
     groups = {"pose": poses, "intrinsics": K[None], "log_scale": np.zeros((FRAMES, 1)), "landmark": WORLD}
     dropped: dict[str, int] = {}
-    state, kept = _drop_outliers(
+    state, kept = drop_outliers(
         State(groups, VariableNames(landmark_track=np.arange(TRACKS))), observations, CONFIG, dropped
     )
     assert {reason: count for reason, count in dropped.items() if count} == {"observation behind the camera": TRACKS}

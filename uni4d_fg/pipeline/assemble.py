@@ -47,6 +47,8 @@ def assemble(sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion
         dynamic_track=dynamic_track,
         dynamic_instance=motion["instance"].astype(np.int32),
         dynamic_color=colors[len(landmark_track) :],
+        pose_covariance=scene.get("pose_covariance"),
+        intrinsics_covariance=scene.get("intrinsics_covariance"),
     )
 
 

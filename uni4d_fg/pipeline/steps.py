@@ -118,6 +118,8 @@ def _bundle_arrays(result: BundleAdjustmentResult) -> dict[str, npt.NDArray[Any]
         "landmarks": result.landmarks,
         "landmark_track": result.landmark_track,
         "landmark_error": result.landmark_error,
+        "pose_covariance": result.pose_covariance,
+        "intrinsics_covariance": result.intrinsics_covariance,
         "noise": np.array([result.noise.reprojection_sigma_px, result.noise.depth_sigma]),
     }
 

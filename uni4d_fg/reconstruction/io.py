@@ -33,6 +33,11 @@ _LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "dynamic_instance": ("int32", ("M",)),
     "dynamic_color": ("uint8", ("M", 3)),
 }
+_OPTIONAL: dict[str, tuple[str, tuple[str | int, ...]]] = {
+    "pose_covariance": ("float64", ("T", 6, 6)),
+    "intrinsics_covariance": ("float64", (4, 4)),
+}
+_MAY_BE_NAN = ("dynamic_points", "landmark_error", *_OPTIONAL)
 
 
 def save_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
@@ -42,10 +47,12 @@ def save_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         OutputError: If it is not a valid reconstruction (it could not be read back) or cannot be written.
     """
     arrays = {name: np.asarray(getattr(reconstruction, name)) for name in _LAYOUT}
+    known = {name: getattr(reconstruction, name) for name in _OPTIONAL}
+    arrays |= {name: np.asarray(array) for name, array in known.items() if array is not None}
     problem = _problem(arrays)
     if problem:
         raise OutputError(f"{path}: not written, the reconstruction is not valid: {problem}")
-    typed = {name: arrays[name].astype(dtype) for name, (dtype, _) in _LAYOUT.items()}
+    typed = {name: array.astype((_LAYOUT | _OPTIONAL)[name][0]) for name, array in arrays.items()}
     save_npz(path, format_version=np.int64(FORMAT_VERSION), **typed)
 
 
@@ -62,11 +69,12 @@ def load_reconstruction(path: Path) -> Reconstruction:
             f"{path}: format version {version}, but this program reads version {FORMAT_VERSION}; "
             "use the version of uni4d_fg that wrote it"
         )
-    arrays = load_npz(path, {name: len(shape) for name, (_, shape) in _LAYOUT.items()}, {})
+    required, optional = ({name: len(shape) for name, (_, shape) in part.items()} for part in (_LAYOUT, _OPTIONAL))
+    arrays = load_npz(path, required, optional)
     problem = _problem(arrays)
     if problem:
         raise InputError(f"{path}: not a valid reconstruction: {problem}")
-    values: dict[str, Any] = {name: arrays[name].astype(dtype) for name, (dtype, _) in _LAYOUT.items()}
+    values: dict[str, Any] = {name: array.astype((_LAYOUT | _OPTIONAL)[name][0]) for name, array in arrays.items()}
     height, width = values.pop("image_size").tolist()
     return Reconstruction(image_size=(height, width), **values)
 
@@ -74,7 +82,9 @@ def load_reconstruction(path: Path) -> Reconstruction:
 def _problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
     """Return what is wrong with the arrays of a reconstruction, or None."""
     sizes: dict[str, int] = {}
-    for name, (dtype, shape) in _LAYOUT.items():
+    for name, (dtype, shape) in (_LAYOUT | _OPTIONAL).items():
+        if name not in arrays:
+            continue
         actual = arrays[name].shape
         expected = "(" + ", ".join(map(str, shape)) + ")"
         if len(actual) != len(shape):
@@ -88,7 +98,7 @@ def _problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
             return f"{name} has dtype {arrays[name].dtype}, expected {dtype}"
         if dtype == "bool" and arrays[name].dtype.kind != "b":
             return f"{name} has dtype {arrays[name].dtype}, expected bool"
-        if name not in ("dynamic_points", "landmark_error") and not np.isfinite(arrays[name]).all():
+        if name not in _MAY_BE_NAN and not np.isfinite(arrays[name]).all():
             return f"{name} has a value that is NaN or infinite"
     return _value_problem(arrays)
 
@@ -113,4 +123,7 @@ def _value_problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
         return "an observed dynamic point has no position"
     if np.isinf(arrays["landmark_error"]).any():
         return "landmark_error has an infinite value"
+    for name in _OPTIONAL:
+        if name in arrays and np.isinf(arrays[name]).any():
+            return f"{name} has an infinite value"
     return None

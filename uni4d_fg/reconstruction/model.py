@@ -42,6 +42,11 @@ class Reconstruction:
     """(M,) mask id."""
     dynamic_color: ImageArray
     """(M, 3) RGB."""
+    pose_covariance: FloatArray | None = None
+    """(T, 6, 6) marginal covariance of each pose's body-frame twist (rotation rad, translation m) relative to the
+    first camera, see :mod:`uni4d_fg.solve.marginals`; NaN where it is not determined, None in files without it."""
+    intrinsics_covariance: FloatArray | None = None
+    """(4, 4) px^2, marginal; zero for entries that were held."""
 
     @property
     def num_frames(self) -> int:

@@ -22,6 +22,7 @@ from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 from uni4d_fg.graph.state import State, VariableNames
 from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.marginals import camera_marginals
 from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.lifting import lift, mean_per_row
 from uni4d_fg.stages.noise import intraclass_correlation, robust_sigma
@@ -66,6 +67,10 @@ class BundleAdjustmentResult:
     noise: StaticNoise
     landmark_error: Float32Array
     """(N,) median reprojection error, px."""
+    pose_covariance: FloatArray
+    """(T, 6, 6) marginal covariance of each pose's body-frame twist (rad, m), relative to frame 0; NaN if unknown."""
+    intrinsics_covariance: FloatArray
+    """(4, 4) px^2; zero for entries that are held, NaN if unknown."""
     solves: list[SolveSummary] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     """Number of observations or landmarks dropped, per reason."""
@@ -240,6 +245,7 @@ def adjust_bundle(
     state = _make_state(world_T_cam, intrinsics, zero_scale, landmarks, observations)
     noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma, config.depth_correlation)
     solves: list[SolveSummary] = []
+    pose_covariance, intrinsics_covariance = unknown_covariances(num_frames)
     rounds = 1 if unsquared or not config.measure_noise else 2
     for index in range(rounds):
         stage = bundle_adjustment_stage(
@@ -252,19 +258,21 @@ def adjust_bundle(
             break
         if config.depth_prior and freedom.poses:
             state = _hold_metric_scale(state)
-        state, observations = _drop_outliers(state, observations, config, dropped)
+        if index == rounds - 1 and not unsquared:
+            pose_covariance, intrinsics_covariance = _covariances(stage, state)
+        state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
             counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)
             raise DegenerateProblemError(
                 f"bundle adjustment: every observation was dropped in round {index + 1} ({counts}); "
                 "check intrinsics and masks, or raise max_reprojection_px and max_depth_ratio"
             )
-        noise = _measure(state, observations, noise, config)
+        noise = measure_noise(state, observations, noise, config)
     if config.structure == "refine" and not unsquared and solves[-1].termination is not Termination.CANCELLED:
         for _ in range(2):  # the second solve uses the depth noise that the first one reveals
             state, summary = run(structure_stage(state, observations, noise, config), state, hooks)
             solves.append(summary)
-            noise = _measure(state, observations, noise, config)
+            noise = measure_noise(state, observations, noise, config)
     landmarks = state["landmark"]
     if config.structure == "relift":
         tracks, row = observations.rows()
@@ -280,12 +288,25 @@ def adjust_bundle(
             f"bundle adjustment: all {len(keep)} landmarks are dropped as far from their neighbours; "
             "raise outlier_factor or outlier_quantile"
         )
-    error = _landmark_error(state.replace(landmark=landmarks), observations)[keep]
+    error = landmark_errors(state.replace(landmark=landmarks), observations)[keep]
     observations = observations.select(np.isin(observations.track, track[keep]))
     return BundleAdjustmentResult(
         state["pose"], state["intrinsics"][0], state["log_scale"][:, 0], landmarks[keep], track[keep],
-        observations, noise, error, solves, dropped,
+        observations, noise, error, pose_covariance, intrinsics_covariance, solves, dropped,
     )  # fmt: skip
+
+
+def unknown_covariances(num_frames: int) -> tuple[FloatArray, FloatArray]:
+    """Return pose (T, 6, 6) and intrinsics (4, 4) covariances that say nothing: NaN."""
+    return np.full((num_frames, 6, 6), np.nan), np.full((4, 4), np.nan)
+
+
+def _covariances(stage: Stage, state: State) -> tuple[FloatArray, FloatArray]:
+    """Return the marginal covariances at the end of a MAP solve; the paper's norms are no likelihood."""
+    marginals = camera_marginals(stage.problem, state, stage.solver, stage.eliminate)
+    if marginals is None:
+        return unknown_covariances(len(state["pose"]))
+    return marginals.blocks("pose", len(state["pose"])), marginals.blocks("intrinsics", 1)[0]
 
 
 def _hold_metric_scale(state: State) -> State:
@@ -303,17 +324,17 @@ def _hold_metric_scale(state: State) -> State:
     return state.replace(pose=poses, landmark=landmarks, log_scale=state["log_scale"] - shift)
 
 
-def _reprojection_residual(state: State, observations: Observations, row: IntArray) -> FloatArray:
+def reprojection_residual(state: State, observations: Observations, row: IntArray) -> FloatArray:
     """Return the raw reprojection residual of every observation, (N, 2) px; ``row`` is its landmark's row."""
     pose, landmark = state["pose"][observations.frame], state["landmark"][row]
     residual: FloatArray = STATIC_REPROJECTION.residual(pose, landmark, state["intrinsics"], uv=observations.uv)
     return residual
 
 
-def _landmark_error(state: State, observations: Observations) -> Float32Array:
+def landmark_errors(state: State, observations: Observations) -> Float32Array:
     """Return each landmark's median reprojection error, (N,) px."""
     tracks, row = observations.rows()
-    residual = _reprojection_residual(state, observations, row)
+    residual = reprojection_residual(state, observations, row)
     norm = np.linalg.norm(residual, axis=1)
     order = np.lexsort([norm, row])
     start = np.searchsorted(row[order], np.arange(len(tracks) + 1))
@@ -353,13 +374,13 @@ def _liftable(
     return observations.select(known[row]), landmarks[known]
 
 
-def _drop_outliers(
+def drop_outliers(
     state: State, observations: Observations, config: BundleAdjustmentConfig, dropped: dict[str, int]
 ) -> tuple[State, Observations]:
     """Drop observations behind the camera, too far off, or of landmarks whose depth contradicts the cue."""
     tracks, row = observations.rows()
     z = world_to_camera(state["pose"][observations.frame], state["landmark"][row])[:, 2]
-    residual = _reprojection_residual(state, observations, row)
+    residual = reprojection_residual(state, observations, row)
     behind = z <= NEAR_PLANE
     far = ~behind & (np.linalg.norm(residual, axis=1) > config.max_reprojection_px)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -383,13 +404,13 @@ def _drop_outliers(
     return State({**state.groups, "landmark": state["landmark"][stays]}, names), kept
 
 
-def _measure(
+def measure_noise(
     state: State, observations: Observations, noise: StaticNoise, config: BundleAdjustmentConfig
 ) -> StaticNoise:
     """Measure the noise of the static scene from what is left."""
     _, row = observations.rows()
     pose, landmark = state["pose"][observations.frame], state["landmark"][row]
-    reprojection = _reprojection_residual(state, observations, row)
+    reprojection = reprojection_residual(state, observations, row)
     known = np.isfinite(observations.depth)
     depth = STATIC_DEPTH_PRIOR.residual(
         pose[known], landmark[known], state["log_scale"][observations.frame[known]], depth=observations.depth[known]

@@ -297,14 +297,14 @@ def solve_nonrigid(
     state, summary = run(stage, state, hooks)
     points = np.full((*mesh.row.shape, 3), np.nan)
     points[mesh.row >= 0] = state["dynamic_point"]
-    near, calm = _spatial_inliers(points, mesh, config), _energy_inliers(points, mesh, config)
+    near, calm = spatial_inliers(points, mesh, config), energy_inliers(points, mesh, config)
     keep = near & calm
     dropped["dynamic track far from its instance"] = int((~near).sum())
     dropped["dynamic track with a large motion energy"] = int((near & ~calm).sum())
     return NonRigidResult(points[keep], mesh.observed[keep], mesh.track[keep], mesh.instance[keep], summary, dropped)
 
 
-def _energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
+def energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
     """Return which trajectories move plausibly.
 
     A trajectory's score is the largest over its frames of its own smoothness residual plus the mean change
@@ -327,7 +327,7 @@ def _energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig)
     return result
 
 
-def _spatial_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
+def spatial_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
     """Return which trajectories are near others of their instance.
 
     A trajectory's score is the median over its observed frames of the distance to its nearest neighbour; one
