@@ -1,0 +1,147 @@
+r"""Taking variables out of a problem and leaving what they said as a linear prior on the others.
+
+The factors that read a leaving variable are linearised once, at the current state. The landmarks among the
+leaving are eliminated first (they are block-diagonal), then the leaving cameras by a dense Schur complement,
+
+    H = H_rr - H_rm H_mm^{-1} H_mr,     g = g_r - H_rm H_mm^{-1} g_m,
+
+and (H, g) is kept as ``R d + q`` with ``R^T R = H``, ``R^T q = g`` (see :mod:`uni4d_fg.factors.linear_prior`). For
+linear factors nothing is lost: solving what is left gives what the whole problem gives. For others the
+linearisation stays where it was. The factors that remain are linearised at the current estimate, not at that
+point: the first estimate of a variable is the point that its prior was made at, so that the prior itself never
+moves to another one, but live factors keep their convergence. Evaluating both at first estimates guards
+directions that no factor observes against information that is not there; here none is unobserved, because the
+first pose is held and the depth prior holds the scale, and a window is solved before anything leaves it.
+Source: Dong-Si and Mourikis 2011, "Motion tracking with fixed-lag smoothing: algorithm and consistency analysis".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.factors.batch import FactorBatch, Slot
+from uni4d_fg.factors.linear_prior import linear_prior_family
+from uni4d_fg.graph.problem import Problem
+from uni4d_fg.graph.state import State
+from uni4d_fg.solve.marginals import reduced_hessian
+from uni4d_fg.solve.threads import one_blas_thread
+
+_RELATIVE_ZERO = 1e-12
+"""Eigenvalues of the scaled information below this part of the largest carry no information."""
+_POINT_RELATIVE_ZERO = 1e-9
+
+
+def determined_points(batches: tuple[FactorBatch, ...], state: State, group: str = "landmark") -> BoolArray:
+    """Return which points (N,) of a group the factors determine when everything else is held."""
+    hessian = np.zeros((len(state[group]), 3, 3))
+    for batch in batches:
+        slots = [i for i, s in enumerate(batch.slots) if s.group == group]
+        if not slots or len(batch) == 0:
+            continue
+        _, jacobians = batch.linearize(state)
+        for i in slots:
+            np.add.at(hessian, batch.slots[i].rows, np.swapaxes(jacobians[i], 1, 2) @ jacobians[i])
+    values = np.linalg.eigvalsh(hessian)
+    result: BoolArray = values[:, 0] > _POINT_RELATIVE_ZERO * np.maximum(values[:, 2], 1e-300)
+    return result
+
+
+def marginalise(
+    batches: tuple[FactorBatch, ...],
+    state: State,
+    free: Mapping[str, BoolArray],
+    leaving: Mapping[str, BoolArray],
+    config: SolverConfig,
+    eliminate: str | None = "landmark",
+) -> FactorBatch | None:
+    """Turn factors into a linear prior on the variables that stay.
+
+    Args:
+        batches: The factors to use up: every one that reads a leaving variable, and no other.
+        state: Linearisation point.
+        free: Free entries per camera group (n, dim); entries that are not free are constants. Points of
+            ``eliminate`` that the batches read all leave.
+        leaving: Rows (n,) per camera group that leave.
+        config: Options of the solver.
+        eliminate: Group of points that leave.
+
+    Returns:
+        A batch of one factor on the rows that stay and that the information touches; None if there is none.
+
+    Raises:
+        SolverError: If a factor is not finite.
+    """
+    batches = tuple(batch for batch in batches if len(batch))
+    if eliminate is not None and eliminate in state.groups:
+        known = determined_points(batches, state, eliminate)
+        batches = tuple(_with_points(batch, known, eliminate) for batch in batches)
+        free = {**free, eliminate: np.tile(known[:, None], (1, 3))}
+    reduced = reduced_hessian(Problem(batches, free), state, config, eliminate)
+    if reduced is None:
+        return None
+    layout, hessian, gradient = reduced
+    is_leaving = np.zeros(layout.size, dtype=bool)
+    for group, rows in leaving.items():
+        if group in layout.offset:
+            is_leaving[layout.columns(group, np.flatnonzero(rows)).reshape(-1)] = True
+    touched = layout.free & (np.abs(hessian).max(axis=1, initial=0.0) > 0.0)
+    out = np.flatnonzero(is_leaving & touched)
+    stay = np.flatnonzero(~is_leaving & touched)
+    if len(stay) == 0:
+        return None
+    information, slope = _eliminate(hessian, gradient, stay, out)
+    variables: list[tuple[str, int]] = sorted({layout.locate(column)[:2] for column in stay.tolist()})
+    columns = np.concatenate([layout.columns(group, np.array([row])).reshape(-1) for group, row in variables])
+    place = np.searchsorted(stay, columns)
+    held = (place >= len(stay)) | (stay[np.minimum(place, len(stay) - 1)] != columns)
+    root, offset = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    at = np.flatnonzero(~held)
+    part, _, offset_part = _square_root(information[np.ix_(place[at], place[at])], slope[place[at]])
+    root[np.ix_(at, at)], offset[at] = part, offset_part
+    slots = tuple(Slot(group, np.array([row])) for group, row in variables)
+    points = {f"point_{i}": state[group][[row]].copy() for i, (group, row) in enumerate(variables)}
+    family = linear_prior_family(tuple(group for group, _ in variables))
+    return FactorBatch.create(family, slots, {"root": root[None], "offset": offset[None], **points})
+
+
+def _with_points(batch: FactorBatch, known: BoolArray, group: str) -> FactorBatch:
+    """Leave out the factors on points that they do not determine: such a point carries nothing to the cameras."""
+    rows = next((s.rows for s in batch.slots if s.group == group), None)
+    return batch if rows is None or known[rows].all() else batch.take(np.flatnonzero(known[rows]))
+
+
+def _eliminate(
+    hessian: FloatArray, gradient: FloatArray, stay: IntArray, out: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Schur complement and its gradient on the columns that stay.
+
+    Leaving directions that no factor determines are left out of the inverse: they carry nothing.
+    """
+    information, slope = hessian[np.ix_(stay, stay)], gradient[stay]
+    if len(out) == 0:
+        return information, slope
+    with one_blas_thread():
+        _, inverse, offset = _square_root(hessian[np.ix_(out, out)], gradient[out])
+        link = inverse.T @ hessian[np.ix_(out, stay)]
+        information = information - link.T @ link
+        slope = slope - link.T @ offset
+    return 0.5 * (information + information.T), slope
+
+
+def _square_root(information: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return R, its pseudo-inverse, and q with R^T R = information and R^T q = gradient; rounding is cut off."""
+    if len(information) == 0:
+        return information, information, gradient
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / scale[:, None] / scale)
+    keep = values > _RELATIVE_ZERO * max(float(values[-1]), 0.0)
+    square = np.where(keep, np.sqrt(np.where(keep, values, 1.0)), 0.0)
+    root: FloatArray = square[:, None] * vectors.T * scale
+    inverse = np.where(keep, 1.0 / np.where(keep, square, 1.0), 0.0)
+    offset: FloatArray = inverse * (vectors.T @ (gradient / scale))
+    inverse_root: FloatArray = (vectors / scale[:, None]) * inverse
+    return root, inverse_root, offset
