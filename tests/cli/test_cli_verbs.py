@@ -76,9 +76,9 @@ def test_a_wrong_command_line_exits_with_2(cli: Run, words: list[str]) -> None:
 
 
 def test_config_prints_the_whole_configuration(cli: Run, tmp_path: Path) -> None:
-    code, out, _ = cli("config", "--preset", "paper", "--set", "seed=4")
+    code, out, _ = cli("config", "--preset", "paper", "--set", "camera_init.window=4")
     assert code == 0
-    assert yaml.safe_load(out) == load_config("paper", ["seed=4"]).model_dump(mode="json")
+    assert yaml.safe_load(out) == load_config("paper", ["camera_init.window=4"]).model_dump(mode="json")
     (tmp_path / "c.yaml").write_text(out)
     assert cli("config", "--config", tmp_path / "c.yaml")[1] == out
 
