@@ -75,7 +75,8 @@ def test_accuracy_and_times_of_the_whole_runs(comparison: Comparison) -> None:
         assert 0.0 < run.accuracy["static AbsRel"] < 0.1
         assert run.optimisation_seconds > 0.0
     if comparison.preset == "default":
-        assert comparison.runs["lm"].accuracy["moving points RMSE, m"] < 0.05
+        # Not the points' own error: so short a path hardly determines the rotation that aligns them.
+        assert comparison.runs["lm"].accuracy["moving AbsRel"] < 0.03
 
 
 def test_resuming_takes_over_what_is_finished(comparison: Comparison, sequence: Sequence, folder: Path) -> None:
