@@ -17,7 +17,7 @@
 // As UNI4D_FG_CLONES, with a third version for processors with 512-bit vectors: a pack is one of their registers.
 #if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__linux__) && \
     !defined(UNI4D_FG_NO_CLONES)
-#define UNI4D_FG_WIDE_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=haswell", "default")))
+#define UNI4D_FG_WIDE_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
 #define UNI4D_FG_WIDE_CLONES UNI4D_FG_CLONES
 #endif
