@@ -12,13 +12,11 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.compare.memory import PeakMemory
 from uni4d_fg.compare.task import Task
-from uni4d_fg.compare.trace import Trace, trace_solve
+from uni4d_fg.compare.trace import EQUAL, Trace, trace_solve
 from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.stages.stage import StageRunner
 
 _CURVE_POINTS = 120
-_EQUAL = 1e-6
-"""Two final energies this close, relatively, are equal."""
 _WARM_UP_POLLS = 3
 
 
@@ -160,7 +158,7 @@ def _performance(name: str, traces: Mapping[str, list[list[Trace]]], memory: flo
         memory,
         {other: _reach(mine, energies) for other, energies in goals.items()},
         {
-            other: sum(t.energy > e * (1.0 + _EQUAL) for t, e in zip(first, energies, strict=True))
+            other: sum(t.energy > e * (1.0 + EQUAL) for t, e in zip(first, energies, strict=True))
             for other, energies in goals.items()
             if other != name
         },

@@ -17,8 +17,8 @@ from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.stage import StageRunner
 
-_ROUNDING = 1e-9
-"""Relative slack with which an energy counts as reached."""
+EQUAL = 1e-6
+"""Two energies this close, relatively, are equal, and one of them reached by the other."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Trace:
 
     def time_to_reach(self, energy: float) -> float:
         """Return the first time at which the energy is at most ``energy``, s; infinity if it never is."""
-        reached = np.flatnonzero(self.energies <= energy * (1.0 + _ROUNDING))
+        reached = np.flatnonzero(self.energies <= energy * (1.0 + EQUAL))
         return float(self.seconds[reached[0]]) if len(reached) else math.inf
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from uni4d_fg.compare.comparison import Comparison
 from uni4d_fg.compare.contest import Contest, time_ratio
 from uni4d_fg.compare.solvers import LM
+from uni4d_fg.compare.trace import EQUAL
 
 STAGE_OF_KIND = {"camera_init": "1", "bundle_adjustment": "2", "structure": "2", "nonrigid": "3"}
 ALL_STAGES = "1-3"
-_EQUAL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def losses(comparison: Comparison) -> list[str]:
                 continue
             where = f"{contest.kind} from {contest.start}"
             ratio = contest.energy_ratio(LM, name)
-            if ratio > 1.0 + _EQUAL:
+            if ratio > 1.0 + EQUAL:
                 out.append(f"{where}: LM ends {100 * (ratio - 1):.3g} % above {name}")
             elif mine.higher[name]:
                 out.append(f"{where}: LM ends above {name} in {mine.higher[name]} of {contest.tasks} solves")
@@ -75,7 +75,7 @@ def losses(comparison: Comparison) -> list[str]:
                 out.append(f"{where}: LM needs {time:.2g} times as long as {name} to reach its energy")
     for name, energy in comparison.camera_init_energy.items():
         total = sum(comparison.camera_init_energy[LM].values())
-        if total > sum(energy.values()) * (1.0 + _EQUAL):
+        if total > sum(energy.values()) * (1.0 + EQUAL):
             out.append(f"stage 1 as a whole: LM ends {100 * (total / sum(energy.values()) - 1):.3g} % above {name}")
     for name, run in comparison.runs.items():
         for metric, value in comparison.runs[LM].accuracy.items():

@@ -14,10 +14,10 @@ class SolverConfig(Section):
     relative_decrease: float = setting(
         1e-5, "Stop when an accepted step lowers the energy by less than this part.", gt=0, lt=1
     )
-    smoothed_relative_decrease: float | None = setting(
+    early_relative_decrease: float | None = setting(
         None,
-        "The same for rounds of a stage that smooth its norms more than the last one does (annealing): they only lead "
-        "there. Null takes relative_decrease.",
+        "The same for all rounds of a stage but its last (annealing, warm-up): they only lead there. Null takes "
+        "relative_decrease.",
         gt=0,
         lt=1,
     )

@@ -107,7 +107,7 @@ class BundleAdjustmentConfig(Section):
     )
     solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.")
     structure_solver: SolverConfig = setting(
-        SolverConfig(max_iterations=40, relative_decrease=1e-5),
+        SolverConfig(max_iterations=40, relative_decrease=1e-6),
         "Solver of 'refine': nothing couples the landmarks but the scales, and small steps still pay.",
     )
 
@@ -157,11 +157,20 @@ class NonRigidConfig(Section):
     annealing: tuple[float, ...] = setting(
         (1.0,), "Successive solves with the smoothing of every 'norm' kernel multiplied by these factors; ends at 1."
     )
+    warm_up_reprojection_weight: float = setting(
+        0.01,
+        "A first, loose solve multiplies the weight of E_NR by this, so that a point with a wrong depth cue follows its "
+        "neighbours and its own path before it is held to its ray; 1 leaves that solve out.",
+        gt=0,
+        le=1,
+    )
     outlier_quantile: float = setting(
         0.98, "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.", gt=0, le=1
     )
     outlier_margin: float = setting(1.0, "Added to that quantile.", ge=0)
-    solver: SolverConfig = setting(SolverConfig(max_iterations=40, relative_decrease=1e-6), "Solver.")
+    solver: SolverConfig = setting(
+        SolverConfig(max_iterations=40, relative_decrease=1e-6, early_relative_decrease=1e-2), "Solver."
+    )
 
 
 class FusionConfig(Section):

@@ -26,7 +26,7 @@ from uni4d_fg.stages.bundle_adjustment import StaticNoise
 from uni4d_fg.stages.lifting import lift
 from uni4d_fg.stages.neighbours import nearest_neighbours
 from uni4d_fg.stages.observations import Normalization, Observations, reprojection_weights
-from uni4d_fg.stages.stage import Stage, StageRunner, kernel_of, run_stage
+from uni4d_fg.stages.stage import Round, Stage, StageRunner, kernel_of, run_stage
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,16 @@ def nonrigid_stage(
             )
         )
     free = {"dynamic_point": np.ones((len(state["dynamic_point"]), 3), dtype=bool)}
-    return Stage("nonrigid", tuple(batches), free, config.solver, "trajectory_cg", annealing=config.annealing)
+    return Stage("nonrigid", tuple(batches), free, config.solver, "trajectory_cg", rounds=_rounds(config))
+
+
+def _rounds(config: NonRigidConfig) -> tuple[Round, ...]:
+    """Return the warm-up, if any, and the rounds of annealing."""
+    annealed = tuple(Round(smoothing=factor) for factor in config.annealing)
+    factor = config.warm_up_reprojection_weight
+    if factor == 1.0 or not config.depth_prior:  # without a depth prior nothing else holds the points
+        return annealed
+    return (Round(config.annealing[0], {DYNAMIC_REPROJECTION.name: factor}), *annealed)
 
 
 def _link_weight(weight: float, count: int, unsquared: bool, normalization: Normalization) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from uni4d_fg.arrays import BoolArray
@@ -18,6 +18,30 @@ from uni4d_fg.solve.summary import SolveSummary, Termination
 
 
 @dataclass(frozen=True)
+class Round:
+    """One of several successive solves of a stage: an easier energy that leads to the stage's own."""
+
+    smoothing: float = 1.0
+    """Factor on the smoothing of every 'norm' kernel."""
+    weight: Mapping[str, float] = field(default_factory=dict)
+    """Factor on the weights of terms, by name."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it solves the stage's own energy."""
+        return self.smoothing == 1.0 and all(factor == 1.0 for factor in self.weight.values())
+
+    def apply(self, batch: FactorBatch) -> FactorBatch:
+        """Return a batch as this round sees it."""
+        factor = self.weight.get(batch.name, 1.0)
+        if factor != 1.0:
+            batch = replace(batch, weight=factor * batch.weight)
+        if batch.kernel.kind == "norm" and self.smoothing != 1.0:
+            batch = replace(batch, kernel=Kernel("norm", self.smoothing * batch.kernel.threshold))
+        return batch
+
+
+@dataclass(frozen=True)
 class Stage:
     """A declaration of one solve."""
 
@@ -29,12 +53,12 @@ class Stage:
     linear_solver: LinearSolver = "schur"
     eliminate: str | None = None
     """Group eliminated before the dense solve ('schur')."""
-    annealing: tuple[float, ...] = (1.0,)
-    """Successive solves with every 'norm' kernel's smoothing multiplied by these factors, ending at 1."""
+    rounds: tuple[Round, ...] = (Round(),)
+    """Successive solves; the last one is exact."""
 
     @property
     def problem(self) -> Problem:
-        """The least-squares problem of the last (unsmoothed) solve."""
+        """The least-squares problem of the last round."""
         return Problem(self.batches, self.free)
 
     @property
@@ -67,16 +91,16 @@ def run_stage(
     if not stage.reads_free_variables:
         initial = problem.energies(state)
         return state, SolveSummary(stage.name, Termination.NOTHING_TO_DO, initial, initial, (), {"total": 0.0})
-    # A round without smoothing measures the stage's own energy; GTSAM measures it behind the camera otherwise.
-    exact = [factor == 1.0 and backend.name != "gtsam" for factor in stage.annealing]
+    # An exact round measures the stage's own energy; GTSAM measures it behind the camera otherwise.
+    exact = [step.is_exact and backend.name != "gtsam" for step in stage.rounds]
     initial = {} if exact[0] else problem.energies(state)
     parts: list[SolveSummary] = []
     solvers: list[str] = []
-    for factor in stage.annealing:
-        solver = _round_solver(stage, factor)
+    for index, step in enumerate(stage.rounds):
+        solver = _round_solver(stage, index)
         objective = make_objective(
             backend,
-            Problem(_smoothed(stage.batches, factor), stage.free),
+            Problem(tuple(step.apply(batch) for batch in stage.batches), stage.free),
             state,
             solver,
             eliminate=stage.eliminate,
@@ -104,21 +128,12 @@ class LevenbergMarquardtRunner:
         return run_stage(stage, state, hooks, self.backend)
 
 
-def _round_solver(stage: Stage, factor: float) -> SolverConfig:
-    """Return the solver's options for one round of annealing."""
-    looser = stage.solver.smoothed_relative_decrease
-    if looser is None or factor == stage.annealing[-1]:
+def _round_solver(stage: Stage, index: int) -> SolverConfig:
+    """Return the solver's options for one round."""
+    looser = stage.solver.early_relative_decrease
+    if looser is None or index == len(stage.rounds) - 1:
         return stage.solver
     return stage.solver.model_copy(update={"relative_decrease": looser})
-
-
-def _smoothed(batches: tuple[FactorBatch, ...], factor: float) -> tuple[FactorBatch, ...]:
-    def smooth(batch: FactorBatch) -> FactorBatch:
-        if batch.kernel.kind != "norm" or factor == 1.0:
-            return batch
-        return replace(batch, kernel=Kernel("norm", batch.kernel.threshold * factor))
-
-    return tuple(smooth(batch) for batch in batches)
 
 
 def _join(
