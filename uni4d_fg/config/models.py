@@ -7,6 +7,7 @@ from typing import Literal
 from uni4d_fg.config.adam import AdamConfig
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
+from uni4d_fg.config.incremental import IncrementalConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
 
 
@@ -47,5 +48,6 @@ class Config(Section):
     bundle_adjustment: BundleAdjustmentConfig = setting(BundleAdjustmentConfig(), "Stage 2.")
     nonrigid: NonRigidConfig = setting(NonRigidConfig(), "Stage 3.")
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
+    incremental: IncrementalConfig = setting(IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.")
     fusion: FusionConfig = setting(FusionConfig(), "Fusion.")
     output: OutputConfig = setting(OutputConfig(), "Output.")

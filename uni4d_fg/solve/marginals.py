@@ -23,10 +23,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import TANGENT_DIM, State
+from uni4d_fg.solve.extension import find_extension
 from uni4d_fg.solve.layout import DenseLayout
 from uni4d_fg.solve.schur import SchurObjective
 from uni4d_fg.solve.threads import one_blas_thread
@@ -67,6 +68,17 @@ def reduced_hessian(
     Raises:
         SolverError: If a factor is not finite.
     """
+    if find_extension()[0] is not None and eliminate is not None:
+        from uni4d_fg.solve import cpp_schur
+
+        if cpp_schur.supports(problem, eliminate):
+            compiled = cpp_schur.CppSchurObjective(problem, state, config, eliminate)
+            linearization = compiled.linearize(state)
+            system = linearization.reduced(0.0)
+            if system is None:
+                return None
+            matrix, vector = linearization.dense(system)
+            return compiled.layout, matrix, -vector
     objective = SchurObjective(problem, state, config, eliminate)
     reduced = objective.linearize(state).reduced(0.0)
     if reduced is None:
@@ -128,10 +140,3 @@ def inverse_of_positive_definite(matrix: FloatArray) -> FloatArray | None:
     result: FloatArray = inverse * scale[:, None] * scale
     return result
 
-
-def columns_of(layout: DenseLayout, group: str, rows: IntArray) -> IntArray:
-    """Return the layout's columns of rows of a group, flat; empty if the group is frozen."""
-    if group not in layout.offset:
-        return np.zeros(0, dtype=np.int64)
-    result: IntArray = layout.columns(group, rows).reshape(-1)
-    return result

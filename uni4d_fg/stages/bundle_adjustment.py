@@ -112,7 +112,7 @@ def bundle_adjustment_stage(
     weight = observations.weight
     if unsquared:
         weight = reprojection_weights(observations.frame, weight, num_frames, normalization)
-    batches = [_reprojection_term(observations, row, 1.0 if unsquared else noise.reprojection_sigma_px, weight, config)]
+    batches = [reprojection_term(observations, row, 1.0 if unsquared else noise.reprojection_sigma_px, weight, config)]
     batches += camera_motion_terms(np.arange(num_frames), config.camera_motion, unsquared)
     free: dict[str, BoolArray] = {"landmark": np.ones((len(state["landmark"]), 3), dtype=bool)}
     if freedom.poses:
@@ -144,7 +144,7 @@ def structure_stage(
     """
     num_frames = len(state["pose"])
     _, row = observations.rows()
-    reprojection = _reprojection_term(observations, row, noise.reprojection_sigma_px, observations.weight, config)
+    reprojection = reprojection_term(observations, row, noise.reprojection_sigma_px, observations.weight, config)
     depth = depth_prior_terms(observations, row, min(noise.depth_sigma, config.depth_sigma), num_frames, config)
     free = {
         "landmark": np.ones((len(state["landmark"]), 3), dtype=bool),
@@ -153,7 +153,7 @@ def structure_stage(
     return Stage("structure", (reprojection, *depth), free, config.structure_solver, "schur", eliminate="landmark")
 
 
-def _reprojection_term(
+def reprojection_term(
     observations: Observations, row: IntArray, sigma: float, weight: FloatArray, config: BundleAdjustmentConfig
 ) -> FactorBatch:
     """Return E_BA; ``row`` (N,) is the landmark row of each observation."""

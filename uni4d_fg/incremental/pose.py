@@ -1,0 +1,117 @@
+"""The pose of a new frame: constant velocity, then its tracks against points that are known, robustly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.graph.state import State
+from uni4d_fg.incremental.labels import LabelledFrame
+from uni4d_fg.solve.marginals import camera_marginals
+from uni4d_fg.stages.bundle_adjustment import StaticNoise, depth_prior_terms, reprojection_residual, reprojection_term
+from uni4d_fg.stages.lifting import frame_log_scales
+from uni4d_fg.stages.observations import Observations
+from uni4d_fg.stages.stage import Stage, StageRunner
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """A new frame's pose relative to the known points."""
+
+    world_T_cam: FloatArray
+    log_scale: float
+    inlier: BoolArray
+    """(n,) which of the observations agree with it."""
+    covariance: FloatArray
+    """(6, 6) given the points; NaN if not determined."""
+
+
+def predict(poses: FloatArray, frames: FloatArray, frame: float) -> FloatArray:
+    """Continue the last relative motion (constant velocity per frame).
+
+    Args:
+        poses: (n, 4, 4), the last one or two are used.
+        frames: (n,) their frame numbers.
+        frame: The number of the new one.
+    """
+    if len(poses) < 2:
+        return np.asarray(poses[-1])
+    step = se3.inverse(poses[-2]) @ poses[-1]
+    gap = float(frames[-1] - frames[-2])
+    omega = se3.so3_log(step[None, :3, :3])[0]
+    factor = float(frame - frames[-1]) / gap
+    moved = np.eye(4)
+    moved[:3, :3] = se3.so3_exp(factor * omega)
+    moved[:3, 3] = factor * step[:3, 3]
+    result: FloatArray = se3.orthonormalize(poses[-1] @ moved)
+    return result
+
+
+def locate(
+    guesses: list[FloatArray],
+    tracks: LabelledFrame,
+    points: FloatArray,
+    intrinsics: FloatArray,
+    noise: StaticNoise,
+    config: Config,
+    run: StageRunner,
+) -> FramePose:
+    """Solve a frame's pose and log-scale with the points held, from each guess; the most inliers win.
+
+    Args:
+        guesses: (4, 4) starting poses; later ones are tried only if fewer than half agree.
+        tracks: n observations.
+        points: (n, 3) their world points.
+        intrinsics: (4,).
+        noise: Sigmas.
+        config: Stage 2's kernels and outlier rule, and the pose solver.
+        run: What solves the declared stage.
+    """
+    zero = np.zeros(len(points), dtype=np.int64)
+    observations = Observations(np.arange(len(points)), zero, tracks.uv, tracks.depth, tracks.weight)
+    ba = config.bundle_adjustment
+    sigma = noise.effective_depth_sigma(2.0) * ba.depth_sigma_factor
+    batches = [
+        reprojection_term(observations, observations.track, noise.reprojection_sigma_px, observations.weight, ba),
+        *depth_prior_terms(observations, observations.track, sigma, 1, ba),
+    ]
+    free = {"pose": np.ones((1, 6), dtype=bool), "log_scale": np.ones((1, 1), dtype=bool)}
+    stage = Stage("pose", tuple(batches), free, config.incremental.pose_solver)
+    best: tuple[State, BoolArray] | None = None
+    for guess in guesses:
+        scale = frame_log_scales(observations, guess[None], points, 1)
+        groups = {"pose": guess[None], "intrinsics": intrinsics[None], "log_scale": scale[:, None], "landmark": points}
+        state, _ = run(stage, State(groups), None)
+        error = np.linalg.norm(reprojection_residual(state, observations, observations.track), axis=1)
+        z = world_to_camera(np.broadcast_to(state["pose"][0], (len(points), 4, 4)), points)[:, 2]
+        inlier: BoolArray = (error <= ba.max_reprojection_px) & (z > NEAR_PLANE)
+        if best is None or inlier.sum() > best[1].sum():
+            best = (state, inlier)
+        if inlier.sum() > 0.5 * len(points):
+            break
+    assert best is not None
+    state, inlier = best
+    marginals = camera_marginals(stage.problem, state, stage.solver, None)
+    covariance = np.full((6, 6), np.nan) if marginals is None else marginals.blocks("pose", 1)[0]
+    return FramePose(state["pose"][0], float(state["log_scale"][0, 0]), inlier, covariance)
+
+
+def adjoint(transform: FloatArray) -> FloatArray:
+    """Return Ad (6, 6) of a rigid transform: ``T Exp(xi) = Exp(Ad xi) T``, rotation first."""
+    out = np.zeros((6, 6))
+    rotation, centre = transform[:3, :3], transform[:3, 3]
+    out[:3, :3] = out[3:, 3:] = rotation
+    out[3:, :3] = se3.skew(centre) @ rotation
+    return out
+
+
+def composed_covariance(reference: FloatArray, reference_T_cam: FloatArray, relative: FloatArray) -> FloatArray:
+    """Return the covariance of ``world_T_reference reference_T_cam`` from those of its two parts, (6, 6) each."""
+    back = adjoint(se3.inverse(reference_T_cam))
+    result: FloatArray = back @ reference @ back.T + relative
+    return result
