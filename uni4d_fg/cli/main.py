@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from uni4d_fg.cli import comparison, reconstruction, results, sequences
+from uni4d_fg.cli import comparison, reconstruction, results, sequences, streaming
 from uni4d_fg.cli.console import log_to_stderr, one_line, print_error
 from uni4d_fg.errors import Cancelled, Uni4dFgError
 
@@ -23,7 +23,8 @@ app = typer.Typer(
     epilog="Start with: uni4d-fg demo",
 )
 for verb in (
-    reconstruction.demo, sequences.validate, sequences.track, reconstruction.reconstruct, results.evaluate,
+    reconstruction.demo, sequences.validate, sequences.track, reconstruction.reconstruct, streaming.stream,
+    results.evaluate,
     comparison.compare, sequences.synthesize, results.config,
 ):  # fmt: skip
     app.command()(verb)

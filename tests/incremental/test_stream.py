@@ -1,0 +1,110 @@
+"""Streams into a folder: interrupted, killed and resumed they end as if nothing had happened."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stream_samples import stream, stream_config
+from typer.testing import CliRunner
+
+from uni4d_fg.cli.main import app
+from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.evaluate.tum import read_tum
+from uni4d_fg.incremental.stream import stream_sequence
+from uni4d_fg.reconstruction.io import load_reconstruction
+from uni4d_fg.sequence.write import write_native
+
+FRAMES = 30
+CONFIG = stream_config(
+    "incremental.window=6", "incremental.nonrigid_lag=4", "incremental.nonrigid_window=7",
+    "incremental.keyframe_parallax=0.006", "incremental.checkpoint_interval=7",
+)  # fmt: skip
+KILLED = Path(__file__).with_name("stream_killed.py")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    summary = stream_sequence(stream(FRAMES), folder, CONFIG)
+    assert summary.num_frames == FRAMES
+    assert sum(summary.counts.values()) == FRAMES
+    return folder
+
+
+def assert_same(folder: Path, expected: Path) -> None:
+    """Assert that two streams hold the same reconstruction, number by number."""
+    found, wanted = (load_reconstruction(f / "reconstruction.npz") for f in (folder, expected))
+    for name in found.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
+    np.testing.assert_array_equal(
+        read_tum(folder / "trajectory.tum").world_T_cam, read_tum(expected / "trajectory.tum").world_T_cam
+    )
+    assert not list(folder.rglob(".tmp-*"))
+
+
+@pytest.mark.parametrize("stop_before", [0, 3, 16, 29])
+def test_an_interrupted_stream_goes_on_where_it_was(tmp_path: Path, undisturbed: Path, stop_before: int) -> None:
+    polls = iter(range(FRAMES + 1))
+    with pytest.raises(Cancelled, match=f"before frame {stop_before}"):
+        stream_sequence(stream(FRAMES), tmp_path, CONFIG, should_stop=lambda: next(polls) == stop_before)
+    summary = stream_sequence(stream(FRAMES), tmp_path, CONFIG, resume=True)
+    assert summary.resumed_from == stop_before
+    assert_same(tmp_path, undisturbed)
+
+
+def test_a_killed_stream_goes_on_from_its_last_checkpoint(
+    tmp_path: Path, undisturbed: Path, rng: np.random.Generator
+) -> None:
+    work = tmp_path / "work.pickle"
+    work.write_bytes(pickle.dumps((stream(FRAMES), CONFIG)))
+    moments = [f"frame:{rng.integers(1, 8)}", f"frame:{rng.integers(8, 15)}", "write:2", f"write:{rng.integers(3, 7)}"]
+    folder = tmp_path / "run"
+    for moment in moments:
+        ended = subprocess.run([sys.executable, str(KILLED), str(work), str(folder), moment], check=False)
+        assert ended.returncode in (-signal.SIGKILL, 0)
+    stream_sequence(stream(FRAMES), folder, CONFIG, resume=True)
+    assert_same(folder, undisturbed)
+
+
+def test_poses_are_on_disk_as_frames_leave_the_window(tmp_path: Path) -> None:
+    lines: list[int] = []
+
+    def count(_: object) -> None:
+        path = tmp_path / "trajectory.tum"
+        lines.append(len(path.read_text().splitlines()) if path.exists() else 0)
+
+    stream_sequence(stream(FRAMES), tmp_path, CONFIG, on_frame=count)
+    assert lines[0] == 0
+    assert lines[-1] > 5
+    assert (np.diff(lines) >= 0).all()
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(tmp_path: Path) -> None:
+    polls = iter(range(FRAMES))
+    with pytest.raises(Cancelled):
+        stream_sequence(stream(FRAMES), tmp_path, CONFIG, should_stop=lambda: next(polls) == 5)
+    with pytest.raises(InputError, match="another configuration"):
+        stream_sequence(stream(FRAMES), tmp_path, stream_config(), resume=True)
+    (tmp_path / "stages" / "stream.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"stream\.npz"):
+        stream_sequence(stream(FRAMES), tmp_path, CONFIG, resume=True)
+
+
+def test_the_verb(tmp_path: Path) -> None:
+    write_native(stream(10, objects="none"), tmp_path / "seq")
+    run = tmp_path / "run"
+    words = ["stream", str(tmp_path / "seq"), "--out", str(run), "--quiet"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert "10 frames" in result.output
+    assert "frames a second" in result.output
+    assert load_reconstruction(run / "reconstruction.npz").num_frames == 10
+    assert CliRunner().invoke(app, words).exit_code != 0
+    again = CliRunner().invoke(app, [*words, "--overwrite"])
+    assert again.exit_code == 0, again.output

@@ -1,0 +1,94 @@
+"""The verb ``stream``: a sequence frame by frame, in bounded memory."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from uni4d_fg.cli import options
+from uni4d_fg.cli.console import print_json
+from uni4d_fg.cli.interruption import Interruption, resume_command
+from uni4d_fg.cli.options import LayoutChoice
+from uni4d_fg.cli.progress import progress_reporter
+from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder
+from uni4d_fg.errors import Cancelled
+
+if TYPE_CHECKING:
+    from uni4d_fg.incremental.model import FrameUpdate
+    from uni4d_fg.progress import Reporter
+
+
+def stream(
+    seq: Annotated[
+        Path, typer.Argument(metavar="SEQ", help="Folder of the sequence, or the video in it.", show_default=False)
+    ],
+    out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME-stream if not given.")] = None,
+    config: options.ConfigChoice = None,
+    changes: options.Overrides = None,
+    online_tracks: Annotated[
+        bool, typer.Option("--online-tracks", help="Track online even if the sequence brings tracks.")
+    ] = False,
+    resume: options.Resume = False,
+    overwrite: options.Overwrite = False,
+    layout: options.Layout = LayoutChoice.auto,
+    depth: options.Depth = None,
+    masks: options.Masks = None,
+    tracks: options.Tracks = None,
+    known_intrinsics: options.KnownIntrinsics = False,
+    quiet: options.Quiet = False,
+    json: options.Json = False,
+) -> None:
+    """Reconstruct frame by frame over a sliding window: cameras, static and moving points of a video of any length."""
+    from uni4d_fg.config.load import load_config
+    from uni4d_fg.incremental.stream import stream_sequence
+
+    settings = load_config(config, changes or ())
+    root = seq.parent if seq.is_file() else seq
+    source = SequenceInput.of(
+        root, layout, depth, masks, tracks, depth_gt_scale=1000.0, known_intrinsics=known_intrinsics
+    )
+    run = out or Path("runs") / f"{root.resolve().name}-stream"
+    sequence = source.read()
+    if online_tracks:
+        sequence = replace(sequence, tracks=None)
+    prepare_run_folder(run, resume=resume, overwrite=overwrite)
+    source.save(run)
+    with Interruption() as stop, progress_reporter(quiet) as reporter:
+        reporter.begin("stream", sequence.num_frames)
+        try:
+            summary = stream_sequence(
+                sequence, run, settings, resume=resume, on_frame=_LiveProgress(reporter), should_stop=stop
+            )
+        except Cancelled as error:
+            raise Cancelled(f"{error}: results so far are in {run}; continue with: {resume_command()}") from error
+        reporter.end()
+    if json:
+        print_json(summary.to_dict())
+    else:
+        typer.echo("\n".join([*summary.lines(), f"results: {run}"]))
+
+
+class _LiveProgress:
+    """Turns updates into one line: frame rate, window, reprojection error, memory."""
+
+    def __init__(self, reporter: Reporter):
+        self.reporter = reporter
+        self._last = time.perf_counter()
+        self._interval = 0.0
+
+    def __call__(self, update: FrameUpdate) -> None:
+        from uni4d_fg.pipeline.summary import peak_memory_mb
+
+        now = time.perf_counter()
+        elapsed, self._last = now - self._last, now
+        self._interval = elapsed if self._interval == 0.0 else 0.9 * self._interval + 0.1 * elapsed
+        rate = 1.0 / max(self._interval, 1e-9)
+        self.reporter.advance(
+            update.frame + 1,
+            f"frame {update.frame} {update.status.value}: {rate:.1f}/s, window {update.window}, "
+            f"{update.num_tracks} tracks, {update.reprojection_error_px:.2f} px, {peak_memory_mb():.0f} MB",
+        )
