@@ -21,12 +21,12 @@ from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import State
 from uni4d_fg.solve.camera_terms import BORDER, CameraColumns, CameraSystem, CameraTerms
+from uni4d_fg.solve.extension import KERNEL_CODES
 from uni4d_fg.solve.layout import DenseLayout
 from uni4d_fg.solve.objective import Step
 from uni4d_fg.solve.schur import SchurObjective
 from uni4d_fg.solve.threads import limit_blas_threads, thread_count
 
-_KERNEL_CODES = {"quadratic": 0, "huber": 1, "pseudo_huber": 2, "cauchy": 3, "norm": 4}
 _CAMERA_GROUPS = {"pose", "log_scale", "intrinsics"}
 _THREADED_SIZE = 600
 """Dense systems from this size on are factorised by all threads; below, a second one costs more than it gains."""
@@ -159,7 +159,7 @@ def _arrays(batch: FactorBatch, measured: str) -> tuple[Any, ...]:
     kernel = batch.kernel
     return (
         rows["pose"], rows["landmark"], _dense(batch.data[measured]), _dense(batch.sigma), _dense(batch.weight),
-        _KERNEL_CODES[kernel.kind], kernel.threshold,
+        KERNEL_CODES[kernel.kind], kernel.threshold,
     )  # fmt: skip
 
 
