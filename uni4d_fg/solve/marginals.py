@@ -139,4 +139,3 @@ def inverse_of_positive_definite(matrix: FloatArray) -> FloatArray | None:
     inverse = np.tril(lower) + np.tril(lower, -1).T
     result: FloatArray = inverse * scale[:, None] * scale
     return result
-
