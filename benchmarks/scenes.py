@@ -5,7 +5,12 @@ from __future__ import annotations
 from uni4d_fg.sequence.model import Sequence
 from uni4d_fg.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 
-SCENES = {"30x2000": (30, 29, 23), "60x8000": (60, 43, 31), "100x17500": (100, 50, 35)}
+SCENES = {
+    "12x1500": (12, 32, 24),
+    "30x2000": (30, 29, 23),
+    "60x8000": (60, 43, 31),
+    "100x17500": (100, 50, 35),
+}
 """Frames x tracks: the frames, and the grid of query points that is started every ten of them."""
 PRESETS = ("default", "paper")
 
