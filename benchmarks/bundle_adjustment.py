@@ -1,6 +1,7 @@
 """Bundle adjustment side by side: this package with and without C++, GTSAM and Ceres.
 
     python benchmarks/bundle_adjustment.py [--sizes 60000 350000] [--repeats 3] [--threads 2] [--solvers cpp gtsam]
+                                           [--bal FILE ...] [--plot FILE.png]
 
 Every solver gets the same synthetic problem and the same start, in a process of its own so that its peak memory
 is its own: tracks of 20 to 50 consecutive frames, pixel noise of 1 px with 3 % outliers, shared fx, fy, cx, cy,
@@ -13,6 +14,18 @@ Huber's kernel at 1.345 px, first and last pose fixed. Every solver stops when a
                   held by priors of 1e-6. Building the graph from Python is not counted
     ceres         pycolmap's bundle adjuster on a PINHOLE camera, SPARSE_SCHUR and DENSE_SCHUR (pip install pyceres
                   pycolmap); Ceres' own times, its preprocessing as 'set up'; building the problem is not counted
+
+With --bal the problems are files in the format of "Bundle Adjustment in the Large" (text, .bz2 or .gz) in place of the
+synthetic sizes. Their cameras have a focal length and two radial distortion coefficients each; here all share one
+pinhole camera. Observations are undistorted with the file's own coefficients, divided by their camera's focal length
+and multiplied by the median one; axes are turned to x right, y down, z forward, and the world is scaled to a median
+depth of 10. Observations that cannot be undistorted or whose point is behind the camera are left out, and so are points
+and cameras that are left with too few; their number is printed. The start is the file's, and first and last camera
+are fixed (benchmarks/bal.py). Costs are therefore not those that others report for these files, and where the solvers
+end in different minima the table marks it with (!).
+
+With --plot the times are drawn as well. Peak memory is that of the process while it solves, the problem included; 'of
+which solver' is what is added to it from the start of the solve.
 
 Pixels are coordinates alone, so that no solver's convention for the centre of a pixel enters. An iteration is a
 linearisation; rejected steps count to the time of the iteration they precede.
@@ -27,16 +40,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import resource
-import subprocess
-import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bal import BalProblem, read_bal
+from side_by_side import EQUAL, Times, draw_times, run_apart, run_main, with_memory
 
+from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.factors import FactorBatch, Kernel, Slot
 from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
@@ -84,24 +97,36 @@ def make_problem(observations: int, seed: int = 0) -> tuple[Problem, State]:
             "landmark": points * (1.0 + rng.normal(scale=0.05, size=(count, 1))),
         }
     )
+    return adjustment(state, frame, row, uv), state
+
+
+def bal_problem(file: BalProblem) -> tuple[Problem, State]:
+    """Return a file's problem, started where the file does."""
+    state = State({"pose": file.world_T_cam, "intrinsics": file.intrinsics[None], "landmark": file.points})
+    return adjustment(state, file.camera, file.point, file.uv), state
+
+
+def adjustment(state: State, frame: IntArray, row: IntArray, uv: FloatArray) -> Problem:
+    """Return the problem of observations (M, 2) of landmarks (M,) in frames (M,): first and last pose fixed."""
     slots = (Slot("pose", frame), Slot("landmark", row), Slot("intrinsics", np.zeros(len(row), dtype=np.int64)))
     batch = FactorBatch.create(STATIC_REPROJECTION, slots, {"uv": uv}, kernel=Kernel("huber", THRESHOLD))
     free = {
-        "landmark": np.ones((count, 3), dtype=bool),
-        "pose": np.ones((frames, 6), dtype=bool),
+        "landmark": np.ones((len(state["landmark"]), 3), dtype=bool),
+        "pose": np.ones((len(state["pose"]), 6), dtype=bool),
         "intrinsics": np.ones((1, 4), dtype=bool),
     }
     free["pose"][[0, -1]] = False
-    return Problem((batch,), free), state
+    return Problem((batch,), free)
 
 
 def solve_ours(problem: Problem, state: State, threads: int, cpp: bool) -> dict[str, float]:
     config = SolverConfig(relative_decrease=TOLERANCE, max_iterations=MAX_ITERATIONS)
-    began = time.perf_counter()
-    objective: Objective[State]
     if cpp:
         from uni4d_fg.solve.cpp_schur import CppSchurObjective
 
+    began = time.perf_counter()
+    objective: Objective[State]
+    if cpp:
         objective = CppSchurObjective(problem, state, config, threads=threads)
     else:
         objective = SchurObjective(problem, state, config, threads=threads)
@@ -226,31 +251,33 @@ RUN: dict[str, Callable[[Problem, State, int], dict[str, float]]] = {
 }
 
 
-def run_here(solver: str, size: int, threads: int) -> None:
+def problem_of(size: int | Path) -> tuple[Problem, State]:
+    """Return the synthetic problem of a size, or that of a file."""
+    return bal_problem(read_bal(size)) if isinstance(size, Path) else make_problem(size)
+
+
+def run_here(solver: str, size: int | Path, threads: int) -> None:
     """Solve once in this process and print the result as JSON."""
-    problem, state = make_problem(size)
-    result: dict[str, Any] = {"before_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
-    result |= RUN[solver](problem, state, threads)
-    result["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    problem, state = problem_of(size)
+    result: dict[str, Any] = with_memory(lambda: RUN[solver](problem, state, threads))
     result |= {"observations": len(problem.batches[0]), "landmarks": len(state["landmark"])}
     result["frames"] = len(state["pose"])
     print(json.dumps(result))
 
 
-def run_apart(solver: str, size: int, threads: int, repeats: int) -> dict[str, Any] | None:
-    """Solve in processes of their own and return the fastest; None if the solver is not installed."""
-    command = [sys.executable, __file__, "--here", solver, "--sizes", str(size), "--threads", str(threads)]
-    results = []
-    for _ in range(repeats):
-        done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "2"})
-        if done.returncode != 0:
-            print(f"{solver} at {size}: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
-            return None
-        results.append(json.loads(done.stdout.strip().splitlines()[-1]))
-    return min(results, key=lambda result: float(result["total"]))
+def measured(size: int | Path, solvers: list[str], threads: int, repeats: int) -> dict[str, dict[str, Any]]:
+    """Return the fastest result of every solver; without those that are not installed."""
+    problem = ["--bal", str(size)] if isinstance(size, Path) else ["--sizes", str(size)]
+    results = {}
+    for solver in solvers:
+        arguments = ["--here", solver, *problem, "--threads", str(threads)]
+        result = run_apart(__file__, arguments, repeats, threads)
+        if result is not None:
+            results[solver] = result
+    return results
 
 
-def roofline(size: int) -> None:
+def roofline(size: int | Path) -> None:
     """Print what the C++ passes take per observation, and what memory and arithmetic allow."""
     from uni4d_fg.solve.cpp_schur import CppSchurObjective
 
@@ -262,7 +289,7 @@ def roofline(size: int) -> None:
             times.append(clock() - began)
         return min(times)
 
-    problem, state = make_problem(size)
+    problem, state = problem_of(size)
     objective = CppSchurObjective(problem, state, SolverConfig(), threads=1)
     linearization = objective.linearize(state)
     count = len(problem.batches[0])
@@ -283,8 +310,10 @@ def roofline(size: int) -> None:
     print(f"eliminate   {reduce / count * 1e9:6.1f} ns per observation; {operations / reduce / 1e9:.1f} GFLOP/s")
 
 
-def table(size: int, results: dict[str, dict[str, Any]]) -> None:
+def table(results: dict[str, dict[str, Any]]) -> None:
     """Print one size."""
+    if not results:
+        return
     any_result = next(iter(results.values()))
     lowest = min(result["cost"] for result in results.values())
     reference = results.get("cpp", any_result)
@@ -305,7 +334,8 @@ def table(size: int, results: dict[str, dict[str, Any]]) -> None:
         print(
             f"| {name} | {r['total']:.3f} | {r['total'] / reference['total']:.1f} | {per_iteration[name]:.4f} | "
             f"{per_iteration[name] / own:.1f} | {r['iterations']} | {r['set up']:.3f} | {phases} | "
-            f"{r['peak_mb']:.0f} | {r['peak_mb'] - r['before_mb']:.0f} | {above:.1e}{'' if above < 1e-6 else ' (!)'} |"
+            f"{r['peak_mb']:.0f} | {r['added_mb']:.0f} | {above:.1e}{'' if above < EQUAL else ' (!)'} |",
+            flush=True,
         )
 
 
@@ -316,19 +346,32 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), choices=SOLVERS)
+    parser.add_argument("--bal", type=Path, nargs="+", metavar="FILE", help="files in place of synthetic sizes")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the times")
     parser.add_argument("--roofline", action="store_true", help="time the C++ passes instead")
     parser.add_argument("--here", choices=SOLVERS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    sizes: list[int | Path] = arguments.bal or arguments.sizes
     if arguments.here:
-        run_here(arguments.here, arguments.sizes[0], arguments.threads)
+        run_here(arguments.here, sizes[0], arguments.threads)
         return
-    for size in arguments.sizes:
+    # A malformed file shows before the first run.
+    described = {file: read_bal(file).describe() for file in arguments.bal or []}
+    seconds: dict[str, dict[int | str, float]] = {}
+    for size in sizes:
+        if isinstance(size, Path):
+            print(f"\n{described[size]}", flush=True)
         if arguments.roofline:
             roofline(size)
             continue
-        results = {name: run_apart(name, size, arguments.threads, arguments.repeats) for name in arguments.solvers}
-        table(size, {name: result for name, result in results.items() if result is not None})
+        results = measured(size, arguments.solvers, arguments.threads, arguments.repeats)
+        table(results)
+        for name, result in results.items():
+            key = size.name if isinstance(size, Path) else result["observations"]
+            seconds.setdefault(name, {})[key] = result["total"]
+    if arguments.plot and not arguments.roofline:
+        draw_times(arguments.plot, [Times("Bundle adjustment", "file" if arguments.bal else "observations", seconds)])
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -1,7 +1,7 @@
 """Moving points side by side: this package with and without C++, and GTSAM's linear solvers.
 
     python benchmarks/nonrigid.py [--sizes 400x50x6 1500x50x4] [--growth 25 50 100 200] [--solvers cpp python ...]
-                                  [--repeats 3] [--cholesky]
+                                  [--repeats 3] [--cholesky] [--plot FILE.png]
 
 Every solver gets the same problem (tracks x frames x neighbours: two bodies that turn, drift and breathe, pixels of
 0.5 px with 2 % outliers, depth of 2 %, 10 % of the observations missing; the default energy) and the same start, in a
@@ -21,23 +21,22 @@ and evaluation are those of 'python'.
 `--growth` solves 400 tracks x 6 neighbours with these numbers of frames and prints the exponent of the growth.
 `--cholesky` times what conjugate gradients replace: a banded Cholesky over time, points ordered by frame. A frame of M
 tracks is a block of 3 M, second differences couple it with two others, so that the band has 6 M rows below the
-diagonal: (3 M T) (6 M)^2 = 108 M^3 T flop for T frames.
+diagonal: (3 M T) (6 M)^2 = 108 M^3 T flop for T frames. `--plot` draws the times of the sizes and of the growth.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
-import subprocess
-import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+from side_by_side import Times, draw_times, run_apart, run_main, with_memory
 
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.config.stages import NonRigidConfig
@@ -162,12 +161,18 @@ def _conjugate_gradients(
 def run(solver: str, size: str) -> dict[str, Any]:
     """Solve one problem with one solver in this process."""
     problem, state = make_problem(*map(int, size.split("x")))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    result = with_memory(lambda: solve(solver, problem, state))
+    return {**result, "points": len(state["dynamic_point"]), "factors": sum(len(batch) for batch in problem.batches)}
+
+
+def solve(solver: str, problem: Problem, state: State) -> dict[str, Any]:
+    """Return cost, iterations and times of one solve."""
     config = SOLVER.model_copy(update={"max_iterations": 1}) if solver == "gtsam-metis" else SOLVER
-    began = time.perf_counter()
     if solver == "cpp":
         from uni4d_fg.solve.cpp_trajectory import CppTrajectoryObjective
 
+    began = time.perf_counter()
+    if solver == "cpp":
         objective: Any = CppTrajectoryObjective(problem, state, config)
     elif solver == "python":
         objective = TrajectoryObjective(problem, state, config)
@@ -185,54 +190,61 @@ def run(solver: str, size: str) -> dict[str, Any]:
         "inner": sum(record.inner_iterations for record in summary.iterations),
         "seconds": seconds,
         "total": sum(seconds.values()),
-        "points": len(state["dynamic_point"]),
-        "factors": sum(len(batch) for batch in problem.batches),
-        "memory": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024,
     }
 
 
-def measured(solver: str, size: str, repeats: int) -> dict[str, Any]:
-    """Return the fastest of the repeats, each in a process of its own."""
-    command = [sys.executable, __file__, "--one", solver, size]
-    results = []
-    for _ in range(1 if solver.startswith("gtsam") else repeats):
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-        results.append(json.loads(done.stdout.splitlines()[-1]))
-    return min(results, key=lambda result: float(result["total"]))
+def measured(solver: str, size: str, repeats: int) -> dict[str, Any] | None:
+    """Return the fastest of the repeats, each in a process of its own; None if the solver cannot be used."""
+    return run_apart(__file__, ["--one", solver, size], 1 if solver.startswith("gtsam") else repeats)
 
 
-def table(size: str, solvers: list[str], repeats: int) -> None:
-    """Print one size, all solvers."""
+def label(solver: str) -> str:
+    """Return a solver's name in tables and pictures."""
+    return f"{solver} (one linear solve)" if solver == "gtsam-metis" else solver
+
+
+def table(size: str, solvers: list[str], repeats: int) -> dict[str, float]:
+    """Print one size, all solvers; return the times."""
     rows: dict[str, dict[str, Any]] = {}
     for solver in solvers:
-        rows[solver] = measured(solver, size, repeats)
-    first = rows[solvers[0]]
+        result = measured(solver, size, repeats)
+        if result is not None:
+            rows[solver] = result
+    if not rows:
+        return {}
+    reference, first = next(iter(rows.items()))
     print(f"\n### {size}: {first['points']} points, {first['factors']} factors\n")
     phases = ("set up", "linearize", "solve", "evaluate")
     columns = ("solver", "final cost", "iterations", "inner steps", *(f"{p}, s" for p in phases), "total, s")
-    print("| " + " | ".join((*columns, "added memory, MB", f"total / {solvers[0]}")) + " |")
+    print("| " + " | ".join((*columns, "added memory, MB", f"total / {reference}")) + " |")
     print("|---" * (len(columns) + 2) + "|")
     for solver, row in rows.items():
         inner = "-" if solver.startswith("gtsam") else row["inner"]
-        once = " (one linear solve)" if solver == "gtsam-metis" else ""
         times = " | ".join(f"{row['seconds'][phase]:.3f}" for phase in phases)
         ratio = row["total"] / first["total"]
         print(
-            f"| {solver}{once} | {row['cost']:.2f} | {row['iterations']} | {inner} | {times} | {row['total']:.3f} | "
-            f"{row['memory']:.0f} | {ratio:.1f} |",
+            f"| {label(solver)} | {row['cost']:.2f} | {row['iterations']} | {inner} | {times} | {row['total']:.3f} | "
+            f"{row['added_mb']:.0f} | {ratio:.1f} |",
             flush=True,
         )
+    return {solver: row["total"] for solver, row in rows.items()}
 
 
-def growth(frames: list[int], solvers: list[str], repeats: int) -> None:
-    """Print the time by frames, and the exponent of a power law fitted to it."""
+def growth(frames: list[int], solvers: list[str], repeats: int) -> dict[str, dict[int, float]]:
+    """Print the time by frames, and the exponent of a power law fitted to it; return the times."""
+    seconds: dict[str, dict[int, float]] = {}
     print("\n### 400 tracks x 6 neighbours, by frames: total, s\n")
     print("| solver | " + " | ".join(map(str, frames)) + " | exponent |")
     print("|---" * (len(frames) + 2) + "|")
     for solver in solvers:
-        times = [measured(solver, f"400x{n}x6", repeats)["total"] for n in frames]
+        results = [measured(solver, f"400x{n}x6", repeats) for n in frames]
+        times = [result["total"] for result in results if result is not None]
+        if len(times) < len(frames):
+            continue
+        seconds[solver] = dict(zip(frames, times, strict=True))
         exponent = np.polyfit(np.log(frames), np.log(times), 1)[0]
         print(f"| {solver} | " + " | ".join(f"{t:.3f}" for t in times) + f" | {exponent:.2f} |", flush=True)
+    return seconds
 
 
 def cholesky(sizes: list[str]) -> None:
@@ -271,18 +283,27 @@ def main() -> None:
     parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=list(SOLVERS))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--cholesky", action="store_true")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the times")
     parser.add_argument("--one", nargs=2, metavar=("SOLVER", "SIZE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
         print(json.dumps(run(*arguments.one)))
         return
+    by_size: dict[str, dict[str, float]] = {}
     for size in arguments.sizes:
-        table(size, arguments.solvers, arguments.repeats)
+        for solver, total in table(size, arguments.solvers, arguments.repeats).items():
+            by_size.setdefault(label(solver), {})[size] = total
+    by_frames: dict[str, dict[int, float]] = {}
     if arguments.growth:
-        growth(arguments.growth, [s for s in arguments.solvers if not s.startswith("gtsam")], arguments.repeats)
+        ours = [s for s in arguments.solvers if not s.startswith("gtsam")]
+        by_frames = growth(arguments.growth, ours, arguments.repeats)
     if arguments.cholesky:
         cholesky(["50x50x6", "100x50x6", "200x50x6"])
+    if arguments.plot:
+        panels = [Times("Moving points", "tracks x frames x neighbours", by_size)]
+        panels.append(Times("400 tracks x 6 neighbours", "frames", by_frames))
+        draw_times(arguments.plot, panels)
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)
