@@ -104,7 +104,7 @@ def draw_times(path: Path, panels: list[Times]) -> None:
         panel.tick_params(which="both", labelsize=8, colors=MUTED)
         panel.grid(True, axis="y", which="major", color=GRID, linewidth=0.8)
         panel.set_axisbelow(True)
-        panel.legend(frameon=False, fontsize=8, labelcolor=INK)
+        panel.legend(frameon=False, fontsize=8, labelcolor=INK, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         for spine in panel.spines.values():
             spine.set_visible(False)
     save_figure(path, figure)
@@ -127,3 +127,5 @@ def _draw_bars(panel: Axes, times: Times, sizes: list[Any]) -> None:
         bars = panel.bar(place, list(by_size.values()), 0.9 * width, color=(COLOURS * 9)[index], label=solver)
         panel.bar_label(bars, fmt="%.2g", fontsize=7, color=MUTED)
     panel.set_xticks(range(len(sizes)), [str(size) for size in sizes])
+    shortest = min(seconds for by_size in times.seconds.values() for seconds in by_size.values())
+    panel.set_ylim(bottom=10.0 ** np.floor(np.log10(0.8 * shortest)))
