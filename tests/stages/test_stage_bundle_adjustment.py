@@ -14,7 +14,7 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.graph.state import State, VariableNames
 from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.summary import Termination
-from uni4d_fg.stages.bundle_adjustment import BundleAdjustmentResult, Freedom, drop_outliers, adjust_bundle
+from uni4d_fg.stages.bundle_adjustment import BundleAdjustmentResult, Freedom, adjust_bundle, drop_outliers
 from uni4d_fg.stages.observations import Observations
 from uni4d_fg.tracks.model import LabelledTracks
 

@@ -159,7 +159,7 @@ class NonRigidConfig(Section):
     )
     warm_up_reprojection_weight: float = setting(
         0.01,
-        "A first, loose solve multiplies the weight of E_NR by this, so that a point with a wrong depth cue follows its "
+        "A first, loose solve multiplies the weight of E_NR by this, so that a point with a wrong cue follows its "
         "neighbours and its own path before it is held to its ray; 1 leaves that solve out.",
         gt=0,
         le=1,
