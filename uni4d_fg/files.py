@@ -8,6 +8,7 @@ import math
 import os
 import secrets
 import shutil
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -25,6 +26,9 @@ MAX_NPZ_BYTES = 16 * 1024**3
 """Uncompressed size above which an .npz file is refused."""
 
 _BROKEN_ARCHIVE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, OSError, RuntimeError)
+
+_BROKEN_HEADER = (ValueError, SyntaxError, TypeError, LookupError, AttributeError, RecursionError, tokenize.TokenError)
+"""What numpy raises on the header of a damaged array: it parses it as Python, and again as Python 2's."""
 
 
 def write_failure(path: Path, error: OSError) -> OutputError:
@@ -293,7 +297,7 @@ def _array_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], np.dt
             shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
         else:
             raise InputError(f"{where}: .npy format version {version} is not supported; save a plain array")
-    except ValueError as error:
+    except _BROKEN_HEADER as error:
         raise InputError(f"{where}: its header is not that of a .npy array ({error}); write it again") from error
     if dtype.hasobject:
         raise InputError(

@@ -174,6 +174,24 @@ def test_header_that_lies_about_its_size(tmp_path: Path) -> None:
         load_npz(path, {"a": 2})
 
 
+@pytest.mark.filterwarnings(
+    "ignore:Reading `.npy`", "ignore:invalid escape:DeprecationWarning", "ignore:invalid escape:SyntaxWarning"
+)
+@pytest.mark.parametrize("value", b"\x00 z'{}()[]:,9#\\\n\xff")
+def test_any_altered_byte_of_a_header_is_an_input_error_or_harmless(tmp_path: Path, value: int) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.eye(3))
+    data = path.read_bytes()
+    refused = 0
+    for position in range(128):
+        path.write_bytes(data[:position] + bytes([value]) + data[position + 1 :])
+        try:
+            load_npy(path)
+        except InputError:
+            refused += 1
+    assert refused > 20
+
+
 @settings(max_examples=60, deadline=None)
 @given(cut=st.floats(0, 0.999), flip=st.integers(0, 10**6), value=st.integers(0, 255))
 def test_damaged_npz_is_an_input_error_or_intact(
