@@ -206,6 +206,22 @@ def test_the_energy_never_rises_and_the_result_is_finite(
     assert np.isfinite(result.points[result.observed]).all()
 
 
+@pytest.mark.parametrize("warm_up", [0.01, 1e-9])
+def test_the_lower_of_both_ways_is_kept(exact: LabelledTracks, rng: np.random.Generator, warm_up: float) -> None:
+    noisy = with_depth_noise(shift(exact, rng.normal(scale=1.0, size=exact.tracks.uv.shape)), rng, 0.2)
+    with_it = solve(noisy, changed(warm_up_reprojection_weight=warm_up, also_without_warm_up=False)).solve
+    without_it = solve(noisy, changed(warm_up_reprojection_weight=1.0)).solve
+    both = solve(noisy, changed(warm_up_reprojection_weight=warm_up)).solve
+    assert with_it is not None
+    assert without_it is not None
+    assert both is not None
+    ends = [with_it.final_energy, without_it.final_energy]
+    assert ends[0] != ends[1]
+    assert both.notes["schedule_energies"] == ends
+    assert both.final_energy == min(ends)
+    assert len(both.iterations) == len(with_it.iterations) + len(without_it.iterations)
+
+
 def test_coinciding_tracks_have_finite_derivatives(exact: LabelledTracks) -> None:
     result = solve(join(exact, exact))
     assert np.isfinite(result.points).all()

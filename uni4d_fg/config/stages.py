@@ -164,6 +164,9 @@ class NonRigidConfig(Section):
         gt=0,
         le=1,
     )
+    also_without_warm_up: bool = setting(
+        True, "Solve a second time without that first solve, and keep whichever ends at the lower energy."
+    )
     outlier_quantile: float = setting(
         0.98, "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.", gt=0, le=1
     )

@@ -150,16 +150,17 @@ def nonrigid_stage(
             )
         )
     free = {"dynamic_point": np.ones((len(state["dynamic_point"]), 3), dtype=bool)}
-    return Stage("nonrigid", tuple(batches), free, config.solver, "trajectory_cg", rounds=_rounds(config))
+    return Stage("nonrigid", tuple(batches), free, config.solver, "trajectory_cg", schedules=_schedules(config))
 
 
-def _rounds(config: NonRigidConfig) -> tuple[Round, ...]:
-    """Return the warm-up, if any, and the rounds of annealing."""
+def _schedules(config: NonRigidConfig) -> tuple[tuple[Round, ...], ...]:
+    """Return the annealing after the warm-up, if any, and without it if both are asked for."""
     annealed = tuple(Round(smoothing=factor) for factor in config.annealing)
     factor = config.warm_up_reprojection_weight
     if factor == 1.0 or not config.depth_prior:  # without a depth prior nothing else holds the points
-        return annealed
-    return (Round(config.annealing[0], {DYNAMIC_REPROJECTION.name: factor}), *annealed)
+        return (annealed,)
+    warmed = (Round(config.annealing[0], {DYNAMIC_REPROJECTION.name: factor}), *annealed)
+    return (warmed, annealed) if config.also_without_warm_up else (warmed,)
 
 
 def _link_weight(weight: float, count: int, unsquared: bool, normalization: Normalization) -> float:

@@ -14,7 +14,7 @@ from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import State
 from uni4d_fg.solve.backend import Backend, LinearSolver, choose_backend, make_objective, solved_by
 from uni4d_fg.solve.levenberg_marquardt import Hooks, minimize
-from uni4d_fg.solve.summary import SolveSummary, Termination
+from uni4d_fg.solve.summary import IterationRecord, SolveSummary, Termination
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class Stage:
     linear_solver: LinearSolver = "schur"
     eliminate: str | None = None
     """Group eliminated before the dense solve ('schur')."""
-    rounds: tuple[Round, ...] = (Round(),)
-    """Successive solves; the last one is exact."""
+    schedules: tuple[tuple[Round, ...], ...] = ((Round(),),)
+    """Ways to go: successive solves each, of which the last is exact. All start alike; the lowest end is kept."""
 
     @property
     def problem(self) -> Problem:
-        """The least-squares problem of the last round."""
+        """The least-squares problem of the last round of every schedule."""
         return Problem(self.batches, self.free)
 
     @property
@@ -91,13 +91,26 @@ def run_stage(
     if not stage.reads_free_variables:
         initial = problem.energies(state)
         return state, SolveSummary(stage.name, Termination.NOTHING_TO_DO, initial, initial, (), {"total": 0.0})
+    ends: list[tuple[State, SolveSummary]] = []
+    for schedule in stage.schedules:
+        ends.append(_run_schedule(stage, schedule, state, hooks, backend))
+        if ends[-1][1].termination is Termination.CANCELLED:
+            break
+    kept, summary = min(ends, key=lambda end: end[1].final_energy)
+    return kept, _join_schedules(summary, [summary for _, summary in ends])
+
+
+def _run_schedule(
+    stage: Stage, schedule: tuple[Round, ...], state: State, hooks: Hooks | None, backend: Backend
+) -> tuple[State, SolveSummary]:
+    problem = stage.problem
     # An exact round measures the stage's own energy; GTSAM measures it behind the camera otherwise.
-    exact = [step.is_exact and backend.name != "gtsam" for step in stage.rounds]
+    exact = [step.is_exact and backend.name != "gtsam" for step in schedule]
     initial = {} if exact[0] else problem.energies(state)
     parts: list[SolveSummary] = []
     solvers: list[str] = []
-    for index, step in enumerate(stage.rounds):
-        solver = _round_solver(stage, index)
+    for step in schedule:
+        solver = stage.solver if step is schedule[-1] else _early(stage.solver)
         objective = make_objective(
             backend,
             Problem(tuple(step.apply(batch) for batch in stage.batches), stage.free),
@@ -113,8 +126,21 @@ def run_stage(
             break
     initial = parts[0].initial_energies if exact[0] else initial
     final = parts[-1].final_energies if exact[len(parts) - 1] else problem.energies(state)
-    notes = {"backend": backend.name, "solved_by": solvers[-1]}
-    return state, _join(stage, problem, (initial, final), parts, notes)
+    notes: dict[str, Any] = {"backend": backend.name, "solved_by": solvers[-1]}
+    if len(parts) > 1:
+        notes["rounds"] = len(parts)
+    iterations, seconds = _succession(parts)
+    return state, SolveSummary(
+        stage.name,
+        parts[-1].termination,
+        initial,
+        final,
+        iterations,
+        seconds,
+        num_factors=sum(len(batch) for batch in stage.batches),
+        num_variables=sum(int(rows.sum()) for rows in problem.free_rows().values()),
+        notes=notes,
+    )
 
 
 @dataclass(frozen=True)
@@ -128,21 +154,30 @@ class LevenbergMarquardtRunner:
         return run_stage(stage, state, hooks, self.backend)
 
 
-def _round_solver(stage: Stage, index: int) -> SolverConfig:
-    """Return the solver's options for one round."""
-    looser = stage.solver.early_relative_decrease
-    if looser is None or index == len(stage.rounds) - 1:
-        return stage.solver
-    return stage.solver.model_copy(update={"relative_decrease": looser})
+def _early(solver: SolverConfig) -> SolverConfig:
+    """Return the solver's options for all rounds but the last."""
+    looser = solver.early_relative_decrease
+    return solver if looser is None else solver.model_copy(update={"relative_decrease": looser})
 
 
-def _join(
-    stage: Stage,
-    problem: Problem,
-    energies: tuple[dict[str, float], dict[str, float]],
-    parts: list[SolveSummary],
-    notes: dict[str, Any],
-) -> SolveSummary:
+def _join_schedules(kept: SolveSummary, all_of_them: list[SolveSummary]) -> SolveSummary:
+    """Return the summary of the schedule that is kept, with the work of all."""
+    if len(all_of_them) == 1:
+        return kept
+    iterations, seconds = _succession(all_of_them)
+    ends = [summary.final_energy for summary in all_of_them]
+    cancelled = all_of_them[-1].termination is Termination.CANCELLED
+    return replace(
+        kept,
+        termination=Termination.CANCELLED if cancelled else kept.termination,
+        iterations=iterations,
+        seconds=seconds,
+        notes={**kept.notes, "schedule_energies": ends},
+    )
+
+
+def _succession(parts: list[SolveSummary]) -> tuple[tuple[IterationRecord, ...], dict[str, float]]:
+    """Return the iterations of solves that followed each other, on one clock, and the sum of their times."""
     seconds: dict[str, float] = {}
     iterations = []
     for part in parts:
@@ -150,18 +185,7 @@ def _join(
         iterations += [replace(record, seconds=record.seconds + offset) for record in part.iterations]
         for phase, value in part.seconds.items():
             seconds[phase] = seconds.get(phase, 0.0) + value
-    if len(parts) > 1:
-        notes = {**notes, "rounds": len(parts)}
-    return SolveSummary(
-        stage.name,
-        parts[-1].termination,
-        *energies,
-        tuple(iterations),
-        seconds,
-        num_factors=sum(len(batch) for batch in stage.batches),
-        num_variables=sum(int(rows.sum()) for rows in problem.free_rows().values()),
-        notes=notes,
-    )
+    return tuple(iterations), seconds
 
 
 def kernel_of(config: KernelConfig) -> Kernel:
