@@ -57,8 +57,43 @@ class GroundTruth:
 
 
 @dataclass(frozen=True)
+class Video:
+    """What came in: frames, and the cues that came with them; :mod:`uni4d_fg.cues` makes those that are missing.
+
+    Conventions as in :class:`Sequence`.
+    """
+
+    name: str
+    images: FrameSource[ImageArray]
+    """T images (H, W, 3), uint8 RGB, upright."""
+    image_size: tuple[int, int]
+    """(height, width), px."""
+    timestamps: FloatArray
+    """(T,) seconds, strictly increasing; frame index when unknown."""
+    depths: FrameSource[Float32Array] | None = None
+    """T maps (H, W), float32 metres, NaN where missing."""
+    masks: FrameSource[Int32Array] | None = None
+    """T label maps (H, W), int32."""
+    intrinsics: FloatArray | None = None
+    """(4,) fx, fy, cx, cy in px."""
+    tracks: Tracks | None = None
+    root: Path | None = None
+    """Folder or file it was read from, if any."""
+    frame_names: tuple[str, ...] = ()
+    """T stems used to name per-frame outputs."""
+    initial_world_T_cam: FloatArray | None = None
+    """(T, 4, 4)."""
+    ground_truth: GroundTruth = field(default_factory=GroundTruth)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames T."""
+        return len(self.images)
+
+
+@dataclass(frozen=True)
 class Sequence:
-    """One video with its cues.
+    """One video with all its cues.
 
     Conventions: pixel centres at integers; depth is z-depth in metres, NaN where missing (readers turn
     zero, negative and infinite values into NaN); mask 0 is static and > 0 an instance that may move.
