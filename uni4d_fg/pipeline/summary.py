@@ -11,6 +11,8 @@ from typing import Any
 
 from uni4d_fg.solve.summary import SolveSummary
 
+_MAX_CURVE_POINTS = 200
+
 
 @dataclass
 class RunSummary:
@@ -58,9 +60,16 @@ class RunSummary:
 
 
 def solve_dict(summary: SolveSummary) -> dict[str, Any]:
-    """Return a solve's summary without its iteration log."""
+    """Return a solve's summary with its iteration log reduced to some ``[iteration, energy]`` pairs.
+
+    The energies are those that the solve worked on: while a warm-up lasts, not those of its end.
+    """
     data = summary.to_dict()
-    data["num_iterations"] = len(data.pop("iterations"))
+    count = len(data.pop("iterations"))
+    data["num_iterations"] = count
+    step = max(1, -(-count // _MAX_CURVE_POINTS))
+    kept = sorted({*range(0, count, step), *range(max(count - 1, 0), count)})
+    data["energy_curve"] = [[index + 1, summary.iterations[index].energy] for index in kept]
     return data
 
 
