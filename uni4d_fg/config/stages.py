@@ -19,6 +19,9 @@ class CameraMotionConfig(Section):
         gt=0,
     )
     translation_floor_m: float = setting(1e-3, "Guard added to the denominator of E_trans, m.", gt=0)
+    norm_threshold: float = setting(
+        3e-3, "Smoothing at zero of both norms ('unsquared' only); the larger, the farther the minimum moves.", gt=0
+    )
 
 
 class CameraInitConfig(Section):

@@ -11,8 +11,6 @@ from uni4d_fg.factors.camera_motion import CAMERA_ROTATION, CAMERA_TRANSLATION
 from uni4d_fg.factors.kernels import Kernel
 from uni4d_fg.factors.priors import ASPECT_PRIOR, INTRINSICS_PRIOR
 
-_NORM_SMOOTHING = 1e-2
-
 
 def camera_motion_terms(frames: IntArray, config: CameraMotionConfig, unsquared: bool) -> list[FactorBatch]:
     """Return E_rot and E_trans over consecutive ``frames`` (W,); empty when switched off or W < 3."""
@@ -20,7 +18,7 @@ def camera_motion_terms(frames: IntArray, config: CameraMotionConfig, unsquared:
         return []
     slots = tuple(Slot("pose", frames[i : len(frames) - 2 + i]) for i in range(3))
     count = len(frames) - 2
-    kernel = Kernel("norm", _NORM_SMOOTHING) if unsquared else Kernel("quadratic")
+    kernel = Kernel("norm", config.norm_threshold) if unsquared else Kernel("quadratic")
     terms = (
         (CAMERA_ROTATION, config.rotation_weight, config.rotation_floor_rad),
         (CAMERA_TRANSLATION, config.translation_weight, config.translation_floor_m),
