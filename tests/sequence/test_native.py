@@ -210,7 +210,6 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         r"rgb: has no \.png, \.jpg, \.jpeg file \(it is empty\)",
     ),
     "image missing": (lambda r: (r / "rgb" / "frame_0002.png").unlink(), "has 4 frames, but there are 3 images"),
-    "no depth": (lambda r: shutil.rmtree(r / "depth_cue"), "has no depth: neither depth_cue/"),
     "depth size": (
         lambda r: write_image(r / "depth_cue" / "frame_0000.png", np.ones((5, 5), np.uint16)),
         "is 5 x 5 px, but the first image is 16 x 12 px",
@@ -287,6 +286,17 @@ def test_damage_gives_one_clear_error(tmp_path: Path, kind: str) -> None:
     report = validate_sequence(root, "native")
     assert not report.ok
     assert all(f.message and f.remedy for f in report.findings)
+
+
+def test_depth_is_needed_to_read_a_sequence_but_may_be_made_later(tmp_path: Path) -> None:
+    root = native_folder(tmp_path)
+    shutil.rmtree(root / "depth_cue")
+    with pytest.raises(InputError, match=r"has no depth: neither depth_cue/ nor depth_cue\.npy is there \(found"):
+        read_native(root)
+    report = validate_sequence(root)
+    assert report.ok
+    assert [(f.item, f.message.split(": ")[1]) for f in report.of("warning")] == [("depth", "has no depth")]
+    assert not validate_sequence(root, depth="depth_cue").ok
 
 
 def test_later_frames_are_checked_when_used(tmp_path: Path) -> None:

@@ -6,24 +6,28 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, Int32Array
+from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
 from uni4d_fg.files import load_npz
 from uni4d_fg.sequence.calibration import VaryingIntrinsics, guess_intrinsics, load_intrinsics
 from uni4d_fg.sequence.frames import DepthFolder, ImageFolder, LazyFrames, MaskFolder, NpyDepth, no_masks
 from uni4d_fg.sequence.layout import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MASK_SUFFIXES, SequenceFiles, list_frames
-from uni4d_fg.sequence.model import GroundTruth, Sequence
+from uni4d_fg.sequence.model import GroundTruth, Sequence, Video
 from uni4d_fg.sequence.poses import load_poses, load_timestamps
 from uni4d_fg.sequence.problems import SequenceProblem
+from uni4d_fg.sequence.selection import MIN_FRAMES
 from uni4d_fg.sequence.track_files import RawTracks, load_native_tracks, load_uni4d_tracks
 from uni4d_fg.sequence.video import VideoFrames
 
-MIN_FRAMES = 2
 
+def open_images(path: Path, stop: int | None = None) -> ImageFolder | VideoFrames:
+    """Open a folder of images or a video file; decodes the first frame. Raises InputError.
 
-def open_images(path: Path) -> ImageFolder | VideoFrames:
-    """Open a folder of images or a video file; decodes the first frame. Raises InputError."""
+    Args:
+        path: The folder or file.
+        stop: Frames of a video file from this one on are not looked at.
+    """
     if path.is_file():
-        return VideoFrames(path)
+        return VideoFrames(path, stop)
     return ImageFolder(list_frames(path, IMAGE_SUFFIXES))
 
 
@@ -101,27 +105,76 @@ def frame_names(images: ImageFolder | VideoFrames) -> tuple[str, ...]:
 
 
 def default_timestamps(images: ImageFolder | VideoFrames) -> FloatArray:
-    """Return (T,) seconds by the video's frame rate, or frame indices when that is unknown."""
-    rate = images.frame_rate if isinstance(images, VideoFrames) else None
-    return np.arange(len(images), dtype=np.float64) / (rate or 1.0)
+    """Return (T,) seconds as the video file has them, else by its frame rate, else frame indices."""
+    if not isinstance(images, VideoFrames):
+        return np.arange(len(images), dtype=np.float64)
+    if images.times is not None:
+        return images.times
+    return np.arange(len(images), dtype=np.float64) / (images.frame_rate or 1.0)
 
 
 def assemble(files: SequenceFiles) -> Sequence:
     """Read everything but the frames themselves; of these only the first is decoded.
+
+    Masks that are absent call everything static; intrinsics that are absent are guessed.
+
+    Raises:
+        InputError: With the first thing found wrong, or if there is no depth.
+    """
+    for problem in files.problems:
+        raise problem
+    if files.no_depth is not None:
+        raise files.no_depth
+    return as_sequence(assemble_video(files))
+
+
+def as_sequence(video: Video) -> Sequence:
+    """Return a video with depth as a sequence; absent masks call everything static, absent intrinsics are guessed.
+
+    Raises:
+        InputError: If it has no depth.
+    """
+    if video.depths is None:
+        raise SequenceProblem(video.root or video.name, "has no depth", "add a depth cue")
+    size, num_frames = video.image_size, video.num_frames
+    return Sequence(
+        name=video.name,
+        images=video.images,
+        depths=video.depths,
+        masks=no_masks(size, num_frames) if video.masks is None else video.masks,
+        intrinsics=guess_intrinsics(size) if video.intrinsics is None else video.intrinsics,
+        image_size=size,
+        timestamps=video.timestamps,
+        root=video.root,
+        frame_names=video.frame_names,
+        initial_world_T_cam=video.initial_world_T_cam,
+        tracks=video.tracks,
+        ground_truth=video.ground_truth,
+    )
+
+
+def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
+    """Read everything that is there but the frames themselves; of these only the first is decoded.
+
+    Args:
+        files: What to read.
+        stop: Frames of a video file from this one on are not looked at; only if nothing else has one per frame.
 
     Raises:
         InputError: With the first thing found wrong.
     """
     for problem in files.problems:
         raise problem
-    assert files.images is not None and files.depth is not None  # noqa: PT018 - else it is in problems
-    images = open_images(files.images)
+    assert files.images is not None  # else it is in problems
+    images = open_images(files.images, stop)
     num_frames, size = len(images), images.size
     check_length(files.images, num_frames)
-    depths = open_depth(files.depth, size)
-    check_count(files.depth, len(depths), num_frames)
-    depths[0]
-    masks: LazyFrames[Int32Array] = no_masks(size, num_frames)
+    depths: LazyFrames[Float32Array] | None = None
+    if files.depth is not None:
+        depths = open_depth(files.depth, size)
+        check_count(files.depth, len(depths), num_frames)
+        depths[0]
+    masks: LazyFrames[Int32Array] | None = None
     if files.masks is not None:
         masks = open_masks(files.masks, size)
         check_count(files.masks, len(masks), num_frames)
@@ -129,22 +182,21 @@ def assemble(files: SequenceFiles) -> Sequence:
     tracks = None
     if files.tracks is not None:
         tracks = load_tracks(files, files.tracks).to_tracks(num_frames, size)
-    return Sequence(
-        name=files.root.resolve().name,
+    root = files.root.resolve()
+    return Video(
+        name=root.stem if root.is_file() else root.name,
         images=images,
-        depths=depths,
-        masks=masks,
-        intrinsics=(
-            guess_intrinsics(size) if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size)
-        ),
         image_size=size,
         timestamps=(
             default_timestamps(images) if files.timestamps is None else load_timestamps(files.timestamps, num_frames)
         ),
+        depths=depths,
+        masks=masks,
+        intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
+        tracks=tracks,
         root=files.root,
         frame_names=frame_names(images),
         initial_world_T_cam=None if files.initial_poses is None else load_poses(files.initial_poses, num_frames),
-        tracks=tracks,
         ground_truth=_assemble_truth(files, num_frames, size, None if tracks is None else tracks.num_tracks),
     )
 

@@ -11,9 +11,10 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array
+from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array, IntArray
 from uni4d_fg.files import load_npy
 from uni4d_fg.sequence.decode import clean_depth, read_depth, read_image, read_mask
+from uni4d_fg.sequence.model import FrameSource
 from uni4d_fg.sequence.problems import SequenceProblem
 
 T = TypeVar("T", bound=npt.NDArray[Any])
@@ -159,6 +160,34 @@ class NpyDepth(LazyFrames[Float32Array]):
         if values.shape[0] != self._length or values.shape[-2:] != self.size:
             raise SequenceProblem(self.path, "was changed while it was in use", "start again")
         return clean_depth(values[frame].reshape(self.size))
+
+
+class SelectedFrames(LazyFrames[T]):
+    """Some frames of another source.
+
+    Args:
+        source: The source.
+        frames: (N,) frames of it, in any order.
+    """
+
+    def __init__(self, source: FrameSource[T], frames: IntArray) -> None:
+        self.source = source
+        self.frames = frames
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def where(self, frame: int) -> str:
+        """Return where the source has it from."""
+        return where_of(self.source, int(self.frames[frame]))
+
+    def _read(self, frame: int) -> T:
+        return self.source[int(self.frames[frame])]
+
+
+def where_of(source: FrameSource[Any], frame: int) -> str:
+    """Return where a source has a frame from, for messages."""
+    return source.where(frame) if isinstance(source, LazyFrames) else f"frame {frame}"
 
 
 class ConstantFrames(LazyFrames[T]):

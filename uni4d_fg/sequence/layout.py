@@ -6,16 +6,34 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypedDict
 
 from uni4d_fg.sequence.problems import SequenceProblem, some_of
 
 LayoutName = Literal["native", "uni4d"]
+Layout = Literal["auto", "native", "uni4d"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".png", ".npy")
 MASK_SUFFIXES = (".png", ".npy")
-VIDEO_NAMES = ("video.mp4", "rgb.mp4")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
+VIDEO_STEMS = ("video", "rgb")
+VIDEO_NAMES = tuple(f"{stem}{suffix}" for suffix in VIDEO_SUFFIXES for stem in VIDEO_STEMS)
+
+
+class LayoutOptions(TypedDict, total=False):
+    """Which files of a folder to take where there is a choice; all are optional keyword arguments."""
+
+    depth: str | None
+    """Name of the depth cue; None takes ``depth_cue`` (native) or the only candidate (Uni4D)."""
+    masks: str | None
+    """Mask folder (Uni4D's layout only)."""
+    tracks: str | None
+    """Track folder (Uni4D's layout only)."""
+    depth_gt_scale: float
+    """Units per metre of PNGs in ``depth_gt/`` (Uni4D's layout only; native is millimetres). 1000 by default."""
+    known_intrinsics: bool
+    """Take ``K.npy`` instead of the estimate (Uni4D's layout; native always does). False by default."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +44,7 @@ class SequenceFiles:
     layout: LayoutName
     images: Path | None
     """Folder of images, or a video file."""
-    depth: Path | None
+    depth: Path | None = None
     """Folder of depth maps, or one ``.npy`` file."""
     masks: Path | None = None
     intrinsics: Path | None = None
@@ -39,7 +57,9 @@ class SequenceFiles:
     true_intrinsics: Path | None = None
     ground_truth: Path | None = None
     problems: tuple[SequenceProblem, ...] = ()
-    """What could not be decided or is absent though needed."""
+    """What could not be decided, or is absent though asked for."""
+    no_depth: SequenceProblem | None = None
+    """Said to those who cannot do without depth, where there is none."""
 
 
 def check_root(root: Path) -> None:
@@ -61,11 +81,22 @@ def subfolders(root: Path) -> list[Path]:
 
 
 def find_images(root: Path) -> Path | None:
-    """Return ``rgb/`` or, without it, the video file of a sequence folder; None when there is neither."""
+    """Return where the frames of a sequence folder are; None when it has none.
+
+    That is ``rgb/``, or a video file of one of the names, or the folder itself if it holds image files.
+    """
     folder = root / "rgb"
     if folder.is_dir():
         return folder
-    return next((root / name for name in VIDEO_NAMES if (root / name).is_file()), None)
+    video = next((root / name for name in VIDEO_NAMES if (root / name).is_file()), None)
+    if video is not None:
+        return video
+    return root if any(is_visible_file(p) and p.suffix.lower() in IMAGE_SUFFIXES for p in root.iterdir()) else None
+
+
+def is_visible_file(path: Path) -> bool:
+    """Tell whether ``path`` is a file whose name does not begin with a dot."""
+    return not path.name.startswith(".") and path.is_file()
 
 
 def missing_images(root: Path) -> SequenceProblem:
@@ -73,7 +104,7 @@ def missing_images(root: Path) -> SequenceProblem:
     return SequenceProblem(
         root,
         "has no rgb/ folder and no video",
-        f"put the frames into rgb/, or a {' or '.join(VIDEO_NAMES)} here",
+        "put the frames into rgb/, or a video.mp4 (.mov, .mkv, .avi, .webm) here",
     )
 
 
@@ -86,7 +117,7 @@ def list_frames(folder: Path, suffixes: Iterable[str]) -> tuple[Path, ...]:
     accepted = tuple(suffixes)
     if not folder.is_dir():
         raise SequenceProblem(folder, "is not a folder", f"make it a folder of {', '.join(accepted)} files")
-    names = sorted(p.name for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    names = sorted(p.name for p in folder.iterdir() if is_visible_file(p))
     frames = tuple(folder / name for name in names if Path(name).suffix.lower() in accepted)
     if not frames:
         found = f"it holds {some_of(names, 3)}" if names else "it is empty"

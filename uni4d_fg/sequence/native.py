@@ -19,26 +19,27 @@ from uni4d_fg.sequence.problems import SequenceProblem, some_of
 DEFAULT_DEPTH = "depth_cue"
 
 
-def _depth_candidates(root: Path, depth: str) -> list[Path]:
-    """Return what goes by the name ``depth`` here: a folder, a ``.npy`` file, or both."""
-    named = [root / depth, root / f"{depth}.npy"]
-    found = [path for path in named if path.exists()]
-    if not found and depth == DEFAULT_DEPTH and (root / "depth.npy").exists():
+def _depth_candidates(root: Path, depth: str | None) -> list[Path]:
+    """Return what goes by the name ``depth`` here (by default the usual ones): a folder, a ``.npy`` file, or both."""
+    name = depth or DEFAULT_DEPTH
+    found = [path for path in (root / name, root / f"{name}.npy") if path.exists()]
+    if not found and name == DEFAULT_DEPTH and (root / "depth.npy").exists():
         return [root / "depth.npy"]
     return found
 
 
-def is_native_layout(root: Path, depth: str = DEFAULT_DEPTH) -> bool:
+def is_native_layout(root: Path, depth: str | None = None) -> bool:
     """Tell whether ``root`` holds frames and a depth cue under their native names."""
     return root.is_dir() and find_images(root) is not None and bool(_depth_candidates(root, depth))
 
 
-def find_native_files(root: Path, depth: str = DEFAULT_DEPTH) -> SequenceFiles:
+def find_native_files(root: Path, depth: str | None = None) -> SequenceFiles:
     """Find the files of a sequence in the native layout.
 
     Args:
         root: The sequence folder.
-        depth: Name of the depth cue: a folder of 16-bit PNGs in millimetres, or a ``.npy`` file in metres.
+        depth: Name of the depth cue: a folder of 16-bit PNGs in millimetres, or a ``.npy`` file in metres;
+            None takes ``depth_cue`` or ``depth.npy`` if it is there.
 
     Returns:
         The files; what is wrong with them is in ``problems``.
@@ -52,15 +53,17 @@ def find_native_files(root: Path, depth: str = DEFAULT_DEPTH) -> SequenceFiles:
     if images is None:
         problems.append(missing_images(root))
     candidates = _depth_candidates(root, depth)
+    no_depth = None
     if not candidates:
         folders = some_of([f"{p.name}/" for p in subfolders(root)]) or "no folder"
-        problems.append(
-            SequenceProblem(
-                root,
-                f"has no depth: neither {depth}/ nor {depth}.npy is there (found {folders})",
-                "add it, or name another depth folder or .npy file",
-            )
+        no_depth = SequenceProblem(
+            root,
+            f"has no depth: neither {depth or DEFAULT_DEPTH}/ nor {depth or DEFAULT_DEPTH}.npy is there "
+            f"(found {folders})",
+            "add it, or name another depth folder or .npy file",
         )
+        if depth is not None:
+            problems.append(no_depth)
     elif len(candidates) > 1:
         names = " and ".join(path.name for path in candidates)
         problems.append(SequenceProblem(root, f"has two depth cues, {names}", "remove or rename one of them"))
@@ -79,15 +82,16 @@ def find_native_files(root: Path, depth: str = DEFAULT_DEPTH) -> SequenceFiles:
         true_depth=true_depth,
         ground_truth=existing(root / "ground_truth.npz"),
         problems=tuple(problems),
+        no_depth=no_depth,
     )
 
 
-def read_native(root: Path, depth: str = DEFAULT_DEPTH) -> Sequence:
+def read_native(root: Path, depth: str | None = None) -> Sequence:
     """Read a sequence in the native layout; frames are decoded only when they are used.
 
     ==========================  =========================================================================
     ``rgb/``                    one PNG or JPEG per frame, in the order of their names; without the folder
-                                ``video.mp4`` or ``rgb.mp4``
+                                ``video.mp4`` (``.mov``, ``.mkv``, ...), or the images themselves
     ``K.npy``                   (3, 3) or (T, 3, 3), px; guessed from the image size when absent
     ``depth_cue/``              one 16-bit PNG per frame, millimetres, 0 = missing; or ``depth_cue.npy`` or
                                 ``depth.npy``, (T, H, W) or (T, 1, H, W), metres
@@ -102,7 +106,7 @@ def read_native(root: Path, depth: str = DEFAULT_DEPTH) -> Sequence:
 
     Args:
         root: The sequence folder.
-        depth: Name of the depth cue to use.
+        depth: Name of the depth cue to use; None takes the usual one.
 
     Returns:
         The sequence. Track observations outside the image are not visible.

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING
 
 from uni4d_fg.sequence.assemble import assemble
-from uni4d_fg.sequence.layout import LayoutName, SequenceFiles, check_root, find_images
+from uni4d_fg.sequence.layout import (
+    IMAGE_SUFFIXES,
+    Layout,
+    LayoutName,
+    LayoutOptions,
+    SequenceFiles,
+    check_root,
+    find_images,
+)
 from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.sequence.native import DEFAULT_DEPTH, find_native_files, is_native_layout
+from uni4d_fg.sequence.native import find_native_files, is_native_layout
 from uni4d_fg.sequence.problems import SequenceProblem
 from uni4d_fg.sequence.uni4d_layout import find_uni4d_files, is_uni4d_layout
 
-Layout = Literal["auto", "native", "uni4d"]
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 def detect_layout(root: Path, depth: str | None = None) -> LayoutName:
@@ -26,7 +35,7 @@ def detect_layout(root: Path, depth: str | None = None) -> LayoutName:
         InputError: If it is no folder, has no frames, or fits both layouts.
     """
     check_root(root)
-    native = is_native_layout(root, depth or DEFAULT_DEPTH)
+    native = is_native_layout(root, depth)
     uni4d = is_uni4d_layout(root)
     if native and uni4d:
         if depth is not None:
@@ -44,70 +53,65 @@ def detect_layout(root: Path, depth: str | None = None) -> LayoutName:
     )
 
 
-def find_files(
-    root: Path,
-    layout: Layout = "auto",
-    *,
-    depth: str | None = None,
-    masks: str | None = None,
-    tracks: str | None = None,
-    depth_gt_scale: float = 1000.0,
-    known_intrinsics: bool = False,
-) -> SequenceFiles:
-    """Find the files of a sequence. Arguments and errors as in :func:`read_sequence`."""
+def find_files(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOptions]) -> SequenceFiles:
+    """Find the files of a sequence.
+
+    Args:
+        root: The sequence folder; or a folder of images, or a video file, which bring no cues.
+        layout: "native" or "uni4d"; "auto" looks at what is there.
+        **options: :class:`~uni4d_fg.sequence.layout.LayoutOptions`.
+
+    Raises:
+        InputError: If it cannot be told what ``root`` is, or an option does not fit it.
+    """
     if layout not in ("auto", "native", "uni4d"):
         raise SequenceProblem(root, f"unknown layout {layout!r}", "choose auto, native or uni4d")
-    name = detect_layout(root, depth) if layout == "auto" else layout
+    if root.is_file():
+        return _video_file(root, options)
+    name = detect_layout(root, options.get("depth")) if layout == "auto" else layout
     if name == "uni4d":
-        return find_uni4d_files(
-            root,
-            depth=depth,
-            masks=masks,
-            tracks=tracks,
-            depth_gt_scale=depth_gt_scale,
-            known_intrinsics=known_intrinsics,
-        )
-    if masks is not None or tracks is not None:
+        return find_uni4d_files(root, **options)
+    if options.get("masks") is not None or options.get("tracks") is not None:
         raise SequenceProblem(
             root,
             "mask and track folders can be chosen in Uni4D's layout only",
             "use masks/ and tracks.npz here",
         )
-    return find_native_files(root, depth or DEFAULT_DEPTH)
+    return find_native_files(root, options.get("depth"))
 
 
-def read_sequence(
-    root: Path,
-    layout: Layout = "auto",
-    *,
-    depth: str | None = None,
-    masks: str | None = None,
-    tracks: str | None = None,
-    depth_gt_scale: float = 1000.0,
-    known_intrinsics: bool = False,
-) -> Sequence:
-    """Read a sequence folder; frames are decoded only when they are used.
+def _video_file(path: Path, options: LayoutOptions) -> SequenceFiles:
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise SequenceProblem(path, "is one image", "give a folder of images, or a video file")
+    named = [name for name in ("depth", "masks", "tracks") if options.get(name) is not None]
+    if named:
+        raise SequenceProblem(
+            path,
+            f"is a file, in which no {named[0]} can be chosen by name",
+            "put it into a folder as video.mp4, with its cues beside it",
+        )
+    return SequenceFiles(
+        root=path,
+        layout="native",
+        images=path,
+        no_depth=SequenceProblem(
+            path, "a video file brings no depth", "put it into a folder as video.mp4, with depth_cue.npy beside it"
+        ),
+    )
+
+
+def read_sequence(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOptions]) -> Sequence:
+    """Read a sequence with its depth; frames are decoded only when they are used.
+
+    :func:`~uni4d_fg.sequence.open_video.open_video` does without depth and can take a part of the frames.
 
     Args:
         root: The sequence folder.
         layout: "native" or "uni4d"; "auto" looks at what is there.
-        depth: Name of the depth cue; None takes ``depth_cue`` (native) or the only candidate (Uni4D).
-        masks: Mask folder (Uni4D's layout only).
-        tracks: Track folder (Uni4D's layout only).
-        depth_gt_scale: Units per metre of PNGs in ``depth_gt/`` (Uni4D's layout only; native is millimetres).
-        known_intrinsics: Take ``K.npy`` instead of the estimate (Uni4D's layout; native always does).
+        **options: :class:`~uni4d_fg.sequence.layout.LayoutOptions`.
 
     Raises:
         InputError: With the first thing found wrong; :func:`~uni4d_fg.sequence.validate.validate_sequence`
             lists everything.
     """
-    files = find_files(
-        Path(root),
-        layout,
-        depth=depth,
-        masks=masks,
-        tracks=tracks,
-        depth_gt_scale=depth_gt_scale,
-        known_intrinsics=known_intrinsics,
-    )
-    return assemble(files)
+    return assemble(find_files(Path(root), layout, **options))

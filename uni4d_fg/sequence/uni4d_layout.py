@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from uni4d_fg.sequence.assemble import assemble
 from uni4d_fg.sequence.layout import (
+    LayoutOptions,
     SequenceFiles,
     check_root,
     existing,
@@ -16,6 +18,9 @@ from uni4d_fg.sequence.layout import (
 )
 from uni4d_fg.sequence.model import Sequence
 from uni4d_fg.sequence.problems import SequenceProblem
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _TRACK_FILES = ("results.npz", "filtered_results.npz")
 
@@ -49,7 +54,6 @@ def _choose(
     expected: str,
     holds: Callable[[Path], bool],
     chosen: str | None,
-    required: bool,
     problems: list[SequenceProblem],
 ) -> Path | None:
     """Return the folder of a cue: the chosen one, or the only candidate; what fails goes to ``problems``."""
@@ -65,10 +69,6 @@ def _choose(
         names = ", ".join(folder.name for folder in candidates)
         problems.append(
             SequenceProblem(root, f"has more than one {cue} folder: {names}", f"choose the {cue} folder by name")
-        )
-    elif required:
-        problems.append(
-            SequenceProblem(root, f"has no {cue}: no folder holds {expected}", f"run the {cue} preprocessing first")
         )
     return None
 
@@ -97,9 +97,9 @@ def find_uni4d_files(
     images = find_images(root)
     if images is None:
         problems.append(missing_images(root))
-    depth_folder = _choose(root, "depth", "depth.npy", _has_depth, depth, True, problems)
-    mask_folder = _choose(root, "mask", "Annotations/", _has_masks, masks, False, problems)
-    track_folder = _choose(root, "track", " or ".join(_TRACK_FILES), _has_tracks, tracks, False, problems)
+    depth_folder = _choose(root, "depth", "depth.npy", _has_depth, depth, problems)
+    mask_folder = _choose(root, "mask", "Annotations/", _has_masks, masks, problems)
+    track_folder = _choose(root, "track", " or ".join(_TRACK_FILES), _has_tracks, tracks, problems)
     known = existing(root / "K.npy")
     estimated = None if depth_folder is None else existing(depth_folder / "intrinsics.npy")
     if known_intrinsics and known is None:
@@ -121,18 +121,13 @@ def find_uni4d_files(
         true_depth_units_per_metre=depth_gt_scale,
         true_intrinsics=known,
         problems=tuple(problems),
+        no_depth=SequenceProblem(root, "has no depth: no folder holds depth.npy", "run the depth preprocessing first")
+        if depth_folder is None
+        else None,
     )
 
 
-def read_uni4d(
-    root: Path,
-    *,
-    depth: str | None = None,
-    masks: str | None = None,
-    tracks: str | None = None,
-    depth_gt_scale: float = 1000.0,
-    known_intrinsics: bool = False,
-) -> Sequence:
+def read_uni4d(root: Path, **options: Unpack[LayoutOptions]) -> Sequence:
     """Read a sequence as Uni4D's preprocessing leaves it; frames are decoded only when they are used.
 
     =====================================  ================================================================
@@ -148,11 +143,9 @@ def read_uni4d(
 
     Args:
         root: The sequence folder.
-        depth: Depth folder; None takes the only one there is.
-        masks: Folder that holds ``Annotations/``; None takes the only one there is.
-        tracks: Track folder; None takes the only one there is.
-        depth_gt_scale: Units per metre of true depth in PNGs: 1000, or 256 for KITTI, 5000 for TUM and Bonn.
-        known_intrinsics: Take ``K.npy`` as the intrinsics instead of the depth network's estimate.
+        **options: ``depth``, ``masks``, ``tracks``: names of folders; None takes the only one there is.
+            ``depth_gt_scale``: units per metre of true depth in PNGs: 1000, or 256 for KITTI, 5000 for TUM and
+            Bonn. ``known_intrinsics``: take ``K.npy`` instead of the depth network's estimate.
 
     Returns:
         The sequence. A track is visible where its visibility is 1 and it lies inside the image. True
@@ -161,12 +154,4 @@ def read_uni4d(
     Raises:
         InputError: With the first thing found wrong, among it more than one candidate folder for a cue.
     """
-    files = find_uni4d_files(
-        Path(root),
-        depth=depth,
-        masks=masks,
-        tracks=tracks,
-        depth_gt_scale=depth_gt_scale,
-        known_intrinsics=known_intrinsics,
-    )
-    return assemble(files)
+    return assemble(find_uni4d_files(Path(root), **options))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,13 +14,16 @@ from uni4d_fg.errors import InputError
 from uni4d_fg.sequence import assemble, naming
 from uni4d_fg.sequence.calibration import VaryingIntrinsics, guess_intrinsics, implausible, load_intrinsics
 from uni4d_fg.sequence.frames import FileFrames, ImageFolder, LazyFrames
-from uni4d_fg.sequence.layout import IMAGE_SUFFIXES, SequenceFiles, list_frames
+from uni4d_fg.sequence.layout import IMAGE_SUFFIXES, Layout, LayoutOptions, SequenceFiles, list_frames
 from uni4d_fg.sequence.poses import load_poses, load_timestamps
 from uni4d_fg.sequence.problems import SequenceProblem, some_of
-from uni4d_fg.sequence.read import Layout, find_files
+from uni4d_fg.sequence.read import find_files
 from uni4d_fg.sequence.report import ValidationReport
 from uni4d_fg.sequence.scan import Findings, scan_frames
 from uni4d_fg.sequence.video import VideoFrames
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 MOSTLY_MISSING = 0.5
 """Share of missing depth above which a warning is given."""
@@ -28,16 +31,7 @@ PLAUSIBLE_DEPTH = (0.05, 200.0)
 """Range in metres in which a frame's median depth is expected."""
 
 
-def validate_sequence(
-    root: Path,
-    layout: Layout = "auto",
-    *,
-    depth: str | None = None,
-    masks: str | None = None,
-    tracks: str | None = None,
-    depth_gt_scale: float = 1000.0,
-    known_intrinsics: bool = False,
-) -> ValidationReport:
+def validate_sequence(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOptions]) -> ValidationReport:
     """Read every file of a sequence and list all that is wrong, odd or worth knowing.
 
     Bad content never raises: it becomes a finding that says what to do. Arguments as in
@@ -48,18 +42,7 @@ def validate_sequence(
     """
     root = Path(root)
     findings = Findings()
-    files = findings.attempt(
-        "sequence",
-        lambda: find_files(
-            root,
-            layout,
-            depth=depth,
-            masks=masks,
-            tracks=tracks,
-            depth_gt_scale=depth_gt_scale,
-            known_intrinsics=known_intrinsics,
-        ),
-    )
+    files = findings.attempt("sequence", lambda: find_files(root, layout, **options))
     if files is not None:
         for problem in files.problems:
             findings.add_error("sequence", problem)
@@ -85,6 +68,13 @@ class _Validation:
             self._images(files.images)
         if files.depth is not None:
             self._depth("depth", files.depth, 1000.0)
+        elif files.no_depth is not None and not files.problems:
+            self.findings.add(
+                "warning",
+                "depth",
+                f"{files.no_depth.where}: {files.no_depth.what}",
+                "add it, or have it made by a network; else the scale of the world stays unknown",
+            )
         self._masks(files.masks)
         if self.num_frames is None or self.size is None:
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from pathlib import Path
@@ -10,34 +11,41 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import ImageArray
+from uni4d_fg.arrays import FloatArray, ImageArray
+from uni4d_fg.sequence.containers import missing_bytes
 from uni4d_fg.sequence.frames import LazyFrames
 from uni4d_fg.sequence.problems import SequenceProblem
 
 _CACHED_FRAMES = 4
+_ERRORS_ONLY = 2  # OpenCV's log level
 _REMEDY = "re-encode the video, or extract its frames into rgb/"
 
 
 class VideoFrames(LazyFrames[ImageArray]):
-    """A video file as T images (H, W, 3) uint8 RGB.
+    """A video file as T images (H, W, 3) uint8 RGB, upright as the file's rotation flag says.
 
     Seeking in compressed video is not frame-exact, so frames are reached by decoding forwards: reading in
-    order costs one decode per frame; going back by more than a few frames starts again from the first.
+    order costs one decode per frame; going back by more than a few frames starts again from the first. On
+    construction the frames are decoded once, without keeping them, because what a file announces of their
+    number and times is often wrong.
 
     Args:
         path: The video file.
+        stop: Frames from this one on are not looked at; None for all.
 
     Attributes:
         path: The video file.
         size: (height, width), px.
         frame_rate: Frames per second; None when the file does not say.
+        times: (T,) seconds at which the frames are shown, strictly increasing (variable frame rates included); None
+            when the file has no such times.
 
     Raises:
-        InputError: If the file cannot be opened or holds no frame, and on indexing if a frame cannot be
-            decoded.
+        InputError: If the file cannot be opened, is cut short or holds no frame, and on indexing if a frame
+            cannot be decoded.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, stop: int | None = None) -> None:
         self.path = path
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, ImageArray] = OrderedDict()
@@ -50,32 +58,38 @@ class VideoFrames(LazyFrames[ImageArray]):
         if first is None:
             raise SequenceProblem(path, "holds no frame that can be decoded", _REMEDY)
         self.size: tuple[int, int] = (first.shape[0], first.shape[1])
-        self._length = self._count()
+        self._length, self.times = self._look_through(stop)
 
     def _open(self) -> None:
         if not self.path.is_file():
             raise SequenceProblem(self.path, "no such video file", "check the path")
         self._capture.release()
-        self._capture = cv2.VideoCapture(str(self.path))
+        self._capture = _quiet_capture(self.path)
         self._next = 0
         if not self._capture.isOpened():
+            self._check_complete()
             raise SequenceProblem(self.path, "cannot be opened as a video", _REMEDY)
 
-    def _count(self) -> int:
-        """Count the frames; what the file announces is believed only if its last frame can be decoded."""
-        announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if announced > 0:
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, announced - 1)
-            last_exists = self._capture.grab()
-            beyond_exists = last_exists and self._capture.grab()
-            self._open()
-            if last_exists and not beyond_exists:
-                return announced
-        count = 0
-        while self._capture.grab():
-            count += 1
+    def _check_complete(self) -> None:
+        missing = missing_bytes(self.path)
+        if missing:
+            raise SequenceProblem(
+                self.path,
+                f"is cut short: {missing} bytes are missing at its end",
+                "copy it again, or use its beginning only, by selecting frames up to a stop",
+            )
+
+    def _look_through(self, stop: int | None) -> tuple[int, FloatArray | None]:
+        """Return the number of frames and the times (T,) at which they are shown, in seconds."""
         self._open()
-        return count
+        times: list[float] = []
+        while (stop is None or len(times) < stop) and self._capture.grab():
+            times.append(1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
+        if stop is None or len(times) < stop:
+            self._check_complete()
+        self._open()
+        found = np.array(times)
+        return len(found), found if np.isfinite(found).all() and (np.diff(found) > 0).all() else None
 
     def _advance_to(self, frame: int) -> ImageArray | None:
         """Decode forwards up to ``frame``; None where the file ends or breaks before."""
@@ -110,3 +124,20 @@ class VideoFrames(LazyFrames[ImageArray]):
             while len(self._cache) > _CACHED_FRAMES:
                 self._cache.popitem(last=False)
             return image.copy()
+
+
+def _quiet_capture(path: Path) -> Any:
+    """Open a video without messages of the decoder on stderr; whoever wants them sets the variable."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.getLogLevel()
+    cv2.setLogLevel(min(level, _ERRORS_ONLY))
+    try:
+        return cv2.VideoCapture(str(path), _backend())
+    finally:
+        cv2.setLogLevel(level)
+
+
+def _backend() -> int:
+    """Return OpenCV's FFmpeg reader if this build has it; the others take image files for videos, or guess times."""
+    has_ffmpeg = cv2.CAP_FFMPEG in cv2.videoio_registry.getStreamBackends()
+    return int(cv2.CAP_FFMPEG if has_ffmpeg else cv2.CAP_ANY)

@@ -1,0 +1,136 @@
+"""A video made smaller, with everything that is measured in its pixels.
+
+Pixel centres are at integers, so that the image reaches from -0.5 to W - 0.5. A pixel ``u`` of the full image
+lies at ``(u + 0.5) s - 0.5`` of the small one, where ``s`` is the ratio of the widths (of the heights for v).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, ImageArray
+from uni4d_fg.sequence.frames import LazyFrames, T, where_of
+from uni4d_fg.sequence.model import FrameSource, Video
+from uni4d_fg.tracks.model import Tracks
+
+
+def fitting_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
+    """Return the (height, width) whose longer side is ``max_size`` px, or ``size`` if that is no larger."""
+    scale = max_size / max(size)
+    if scale >= 1:
+        return size
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
+def scale_intrinsics(intrinsics: FloatArray, size: tuple[int, int], new_size: tuple[int, int]) -> FloatArray:
+    """Return the intrinsics of an image after its size changed.
+
+    Args:
+        intrinsics: (4,) fx, fy, cx, cy, px, of images of ``size``.
+        size: (height, width), px.
+        new_size: (height, width), px.
+
+    Returns:
+        (4,) new array, px.
+    """
+    scale = np.array([new_size[1] / size[1], new_size[0] / size[0]])
+    return np.concatenate((intrinsics[:2] * scale, (intrinsics[2:] + 0.5) * scale - 0.5))
+
+
+def resize_image(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    """Return an image (H, W, 3) at a smaller ``size`` (height, width): each pixel the mean of what it covers."""
+    return np.asarray(cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def resize_nearest(array: T, size: tuple[int, int]) -> T:
+    """Return a map (H, W) at another ``size`` (height, width): each pixel the one nearest to its centre."""
+    rows, columns = (
+        np.floor((np.arange(new) + 0.5) * (old / new)).astype(np.int64)
+        for old, new in zip(array.shape[:2], size, strict=True)
+    )
+    return array[np.ix_(rows, columns)]  # type: ignore[return-value]
+
+
+class ResizedImages(LazyFrames[ImageArray]):
+    """Images made smaller as they are read.
+
+    Args:
+        source: T images (H, W, 3).
+        size: New (height, width), px.
+    """
+
+    def __init__(self, source: FrameSource[ImageArray], size: tuple[int, int]) -> None:
+        self.source = source
+        self.size = size
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def where(self, frame: int) -> str:
+        """Return where the source has it from."""
+        return where_of(self.source, frame)
+
+    def _read(self, frame: int) -> ImageArray:
+        return resize_image(self.source[frame], self.size)
+
+
+class ResizedMaps(LazyFrames[T]):
+    """Depth or label maps whose size is changed as they are read, without mixing values.
+
+    Args:
+        source: T maps (H, W).
+        size: New (height, width), px.
+    """
+
+    def __init__(self, source: FrameSource[T], size: tuple[int, int]) -> None:
+        self.source = source
+        self.size = size
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def where(self, frame: int) -> str:
+        """Return where the source has it from."""
+        return where_of(self.source, frame)
+
+    def _read(self, frame: int) -> T:
+        return resize_nearest(self.source[frame], self.size)
+
+
+def resize_video(video: Video, max_size: int) -> Video:
+    """Return a video whose longer side is at most ``max_size`` px; frames are resized as they are read.
+
+    Images are averaged; depth and masks take the nearest pixel; intrinsics and tracks are scaled. The arrays of
+    ``video`` are not changed.
+    """
+    size, new_size = video.image_size, fitting_size(video.image_size, max_size)
+    if new_size == size:
+        return video
+    truth = video.ground_truth
+    return replace(
+        video,
+        images=ResizedImages(video.images, new_size),
+        image_size=new_size,
+        depths=None if video.depths is None else ResizedMaps(video.depths, new_size),
+        masks=None if video.masks is None else ResizedMaps(video.masks, new_size),
+        intrinsics=None if video.intrinsics is None else scale_intrinsics(video.intrinsics, size, new_size),
+        tracks=None if video.tracks is None else resize_tracks(video.tracks, size, new_size),
+        ground_truth=replace(
+            truth,
+            depths=None if truth.depths is None else ResizedMaps(truth.depths, new_size),
+            intrinsics=None if truth.intrinsics is None else scale_intrinsics(truth.intrinsics, size, new_size),
+        ),
+    )
+
+
+def resize_tracks(tracks: Tracks, size: tuple[int, int], new_size: tuple[int, int]) -> Tracks:
+    """Return tracks of images of ``size`` (height, width) for images of ``new_size``.
+
+    An observation that comes to lie outside the pixel centres by rounding stays visible.
+    """
+    scale = np.array([new_size[1] / size[1], new_size[0] / size[0]])
+    uv = ((tracks.uv + 0.5) * scale - 0.5).astype(np.float32)
+    return Tracks(uv, tracks.visible, tracks.query_frame, tracks.confidence)
