@@ -49,3 +49,41 @@ def import_open3d() -> Any:
         library = re.search(r"lib[\w.+-]*\.so[.\d]*", str(error))
         missing = f"the system library {library.group()} is missing" if library else str(error)
         raise MissingDependencyError(f"open3d cannot be loaded, {missing}: run `{_APT_COMMAND}`") from error
+
+
+def import_onnxruntime() -> Any:
+    """Import ONNX Runtime when it is first needed.
+
+    Returns:
+        The ``onnxruntime`` module.
+
+    Raises:
+        MissingDependencyError: If the package is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("onnxruntime")
+    except ModuleNotFoundError as error:
+        missing = error.name or "onnxruntime"
+        command = "pip install 'uni4d-fg[cues]'" if missing == "onnxruntime" else f"pip install {missing}"
+        raise MissingDependencyError(f"networks need {missing}, which is not installed: run `{command}`") from error
+    except (ImportError, OSError) as error:
+        raise MissingDependencyError(f"onnxruntime cannot be loaded ({error}): install it anew") from error
+
+
+def import_viser() -> Any:
+    """Import viser, the server of the interactive view, when it is first needed.
+
+    Returns:
+        The ``viser`` module.
+
+    Raises:
+        MissingDependencyError: If the package is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("viser")
+    except ModuleNotFoundError as error:
+        missing = error.name or "viser"
+        command = "pip install 'uni4d-fg[view]'" if missing == "viser" else f"pip install {missing}"
+        raise MissingDependencyError(f"the viewer needs {missing}, not installed: run `{command}`") from error
+    except (ImportError, OSError) as error:
+        raise MissingDependencyError(f"viser cannot be loaded ({error}): install it anew") from error

@@ -90,6 +90,8 @@ def _problem(model: type[Section], detail: Any) -> tuple[tuple[str, ...], str]:
     field = find_field(model, names)
     if field is None or detail["type"] == "value_error":
         return names, f"{'.'.join(names) or 'values'}: {detail['msg'].removeprefix('Value error, ')}"
+    if detail["type"] == "missing":
+        return names, f"{'.'.join(names)}: is missing, but {allowed_values(field)} is expected"
     entry = " in the list" if any(isinstance(part, int) for part in detail["loc"]) else ""
     given = f"{'.'.join(names)}: got {_shown(detail['input'])}{entry}"
     if section_type(field) is not None:

@@ -70,7 +70,7 @@ def _annotation_text(annotation: Any) -> tuple[str, bool]:
     if origin is Literal:
         return f"one of {', '.join(map(str, arguments))}", False
     if origin is tuple:
-        return "a list of numbers", False
+        return ("a list of texts" if str in arguments else "a list of numbers"), False
     return _TYPE_TEXT.get(annotation, str(annotation)), False
 
 

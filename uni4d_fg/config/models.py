@@ -8,6 +8,7 @@ from uni4d_fg.config.adam import AdamConfig
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
 from uni4d_fg.config.incremental import IncrementalConfig
+from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
 
 
@@ -50,4 +51,5 @@ class Config(Section):
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
     incremental: IncrementalConfig = setting(IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.")
     fusion: FusionConfig = setting(FusionConfig(), "Fusion.")
+    networks: NetworkConfig = setting(NetworkConfig(), "Networks that make cues.")
     output: OutputConfig = setting(OutputConfig(), "Output.")
