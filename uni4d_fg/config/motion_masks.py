@@ -1,0 +1,73 @@
+"""Configuration of masks made from motion alone, and of instances followed over time."""
+
+from __future__ import annotations
+
+from uni4d_fg.config.base import Section, setting
+
+
+class InstanceConfig(Section):
+    """Detections of single frames joined to instances by overlap after optical-flow warping."""
+
+    min_overlap: float = setting(
+        0.2, "Least intersection over union of a warped instance and a detection of the same thing.", gt=0, le=1
+    )
+    max_missed_frames: int = setting(5, "An instance that is not found keeps its number for this many frames ...", ge=0)
+    drawn_missed_frames: int = setting(2, "... and is drawn, moved on by its velocity, in the first of them.", ge=0)
+    join_parts: bool = setting(
+        False, "A further detection within an instance is a part of it: for regions, which break where hidden."
+    )
+    min_score: float = setting(0.3, "Detections below this score are dropped.", ge=0, le=1)
+    min_area_px: int = setting(64, "Detections smaller than this are dropped, px.", ge=1)
+    same_class: bool = setting(False, "Only detections of an instance's own class continue it.")
+    flow_size_px: int = setting(480, "Longer side of the images on which flow is computed, px.", ge=32)
+
+
+class MotionMaskConfig(Section):
+    """Masks of what moves, from tracks, depth and images, without a network."""
+
+    working_size_px: int = setting(384, "Longer side at which images are compared, px.", ge=64)
+    baselines: tuple[int, ...] = setting(
+        (2, 6, 12), "Each frame is compared with the frames this far before and after it.", min_length=1
+    )
+    max_bundle_observations: int = setting(
+        400, "Track observations per frame that the camera solves use, on average.", ge=50
+    )
+    free_intrinsics: bool = setting(True, "Estimate the focal lengths along with the cameras.")
+    track_sigma_px: float = setting(
+        0.7, "Standard deviation of a track's position relative to another frame, px.", gt=0
+    )
+    depth_sigma: float = setting(0.03, "Standard deviation of log depth within a frame.", gt=0)
+    depth_edge_px: float = setting(
+        25.0,
+        "Depth may be displaced against colour by up to half of this, px: near a depth edge, motion along the "
+        "direction in which depth would explain it does not count.",
+        ge=0,
+    )  # fmt: skip
+    track_baselines: tuple[int, ...] = setting(
+        (2, 5, 10, 20), "A track is tested between frames this far apart.", min_length=1
+    )
+    moving_sigmas: float = setting(
+        5.0, "A track moves if it departs from the static scene by more standard deviations than this ...", gt=0
+    )
+    static_sigmas: float = setting(3.0, "... and is static below this; between them it does not say.", gt=0)
+    track_quantile: float = setting(
+        0.8, "Quantile of a track's departures over its frame pairs that is compared with both.", gt=0, le=1
+    )
+    track_weight: float = setting(1.5, "Evidence of a track at its own pixel, in units of log odds.", ge=0)
+    intensity_sigma: float = setting(4.0, "Standard deviation of a pixel's intensity, grey levels.", gt=0)
+    occlusion_margin: float = setting(
+        0.1, "A point is hidden in another frame whose depth there is smaller by more than this fraction.", gt=0
+    )
+    smoothing_px: int = setting(16, "Radius within which evidence is shared among like colours, px.", ge=1)
+    smoothing_contrast: float = setting(0.03, "Standard deviation of colour (0 to 1) within one surface.", gt=0)
+    neighbour_frames_weight: float = setting(
+        0.5, "Weight of the evidence of the frames before and after, warped by flow.", ge=0
+    )  # fmt: skip
+    threshold: float = setting(1.0, "Log odds above which a pixel moves.")
+    min_area_fraction: float = setting(0.002, "Regions smaller than this part of the image are dropped.", ge=0, lt=1)
+    max_static_fraction: float = setting(
+        0.5, "Regions in which more than this share of the decided tracks is static are dropped.", ge=0, le=1
+    )
+    min_frames: int = setting(5, "Instances that move in fewer frames than this are dropped.", ge=1)
+    grow_px: int = setting(2, "Masks are grown by this at the end, px.", ge=0)
+    instances: InstanceConfig = setting(InstanceConfig(join_parts=True), "How regions are joined to instances.")

@@ -1,0 +1,115 @@
+r"""Does a pixel look in other frames as a static scene would have it?
+
+Frame j is compared with frame i at the pixel where i's depth and the cameras put each of its points
+(:mod:`uni4d_fg.cues.static_scene`). The difference of colours ``e`` in a small window has, for a static point,
+the variance of the intensities plus what an error of the predicted pixel makes of the image gradient ``g``,
+
+    s^2 = sigma_I^2 + g^T S g,    S = sigma_u^2 I + (sigma_z du')(sigma_z du')^T,
+
+and for one that has moved also the variance ``c^2`` of the image around it. The evidence is the log of the ratio of
+two normal densities with these variances. It vanishes where the image is flat, where depth is unknown and where the
+point is hidden in frame j, and it forgives depth that is off along the epipolar line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
+from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.cues.depth_range import DepthRange, depth_range
+from uni4d_fg.cues.static_scene import predict_static
+
+_BLUR_PX = 1.5
+_WINDOW_PX = 5
+_SURROUNDING_PX = 15
+_PREDICTION_SIGMA_PX = 1.0
+_MEDIAN_OF_SQUARE = 0.455
+_LIMITS = (-1.0, 3.0)
+
+
+@dataclass(frozen=True)
+class FrameAppearance:
+    """One frame at working size, with what its comparisons need; arrays (h, w), intensities in grey levels."""
+
+    colour: Float32Array
+    """(h, w, 3), slightly blurred."""
+    gradient: tuple[Float32Array, Float32Array, Float32Array]
+    """Sums over colours of gx gx, gx gy, gy gy."""
+    contrast: Float32Array
+    """Variance of the colours around, summed over them."""
+    depth: DepthRange
+    """With the frame's depth scale."""
+
+
+def frame_appearance(image: ImageArray, depth: Float32Array, log_scale: float, edge_window_px: int) -> FrameAppearance:
+    """Prepare a frame.
+
+    Args:
+        image: (h, w, 3) uint8 RGB at working size.
+        depth: (h, w) metres, NaN where missing.
+        log_scale: Log of the factor that makes the depth agree with the cameras.
+        edge_window_px: Side of the window in which depth may be displaced.
+    """
+    colour = cv2.GaussianBlur(image, (0, 0), _BLUR_PX).astype(np.float32)
+    gx, gy = (cv2.Sobel(colour, -1, 1 - axis, axis, ksize=3) / 8 for axis in (0, 1))
+    window = (_SURROUNDING_PX, _SURROUNDING_PX)
+    variance = cv2.boxFilter(colour * colour, -1, window) - cv2.boxFilter(colour, -1, window) ** 2
+    scaled = depth * np.float32(np.exp(log_scale))
+    return FrameAppearance(
+        colour,
+        ((gx * gx).sum(axis=2), (gx * gy).sum(axis=2), (gy * gy).sum(axis=2)),
+        np.maximum(variance, 0).sum(axis=2),
+        depth_range(scaled, edge_window_px),
+    )
+
+
+def moved_evidence(
+    source: FrameAppearance,
+    target: FrameAppearance,
+    target_T_source: FloatArray,
+    intrinsics: FloatArray,
+    shared: tuple[Float32Array, Float32Array],
+    config: MotionMaskConfig,
+) -> Float32Array:
+    """Return the log odds (h, w) that a pixel of ``source`` is not where a static scene has it in ``target``.
+
+    Args:
+        source: Frame the evidence is for.
+        target: Frame it is compared with.
+        target_T_source: (4, 4) pose of the source camera in the target camera.
+        intrinsics: (4,) px at working size.
+        shared: Displacements (h, w) in x and y that errors of the cameras cause, px at working size.
+        config: Sigmas.
+    """
+    height, width = source.contrast.shape
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    static = predict_static(columns, rows, source.depth.log_depth, target_T_source, intrinsics)
+    u, v = (static.u + shared[0]).astype(np.float32), (static.v + shared[1]).astype(np.float32)
+    inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
+    if not inside.any():
+        return np.zeros((height, width), np.float32)
+    seen = cv2.remap(target.colour, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    difference = source.colour - seen
+    difference -= np.median(difference[inside], axis=0)  # exposure
+    squared = cv2.boxFilter((difference * difference).sum(axis=2), -1, (_WINDOW_PX, _WINDOW_PX))
+
+    sigma_depth = config.depth_sigma + 0.5 * source.depth.spread
+    du, dv = sigma_depth * static.du, sigma_depth * static.dv
+    gxx, gxy, gyy = source.gradient
+    variance = 3 * config.intensity_sigma**2 + _PREDICTION_SIGMA_PX**2 * (gxx + gyy)
+    variance += du * du * gxx + 2 * du * dv * gxy + dv * dv * gyy
+    # Blur and noise of this pair of frames: most of the image is static.
+    variance *= max(1.0, float(np.median(squared[inside] / variance[inside])) / _MEDIAN_OF_SQUARE)
+    wider = variance + 2 * source.contrast
+    evidence = 0.5 * (squared / variance - squared / wider - np.log(wider / variance))
+
+    nearest, known = (
+        cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        for values in (target.depth.nearest, target.depth.known.astype(np.float32))
+    )
+    hidden = (known > 0) & (nearest < static.log_z - config.occlusion_margin)
+    return np.where(inside & ~hidden, np.clip(evidence, *_LIMITS), 0).astype(np.float32)
