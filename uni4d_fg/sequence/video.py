@@ -17,7 +17,6 @@ from uni4d_fg.sequence.frames import LazyFrames
 from uni4d_fg.sequence.problems import SequenceProblem
 
 _CACHED_FRAMES = 4
-_ERRORS_ONLY = 2  # OpenCV's log level
 _REMEDY = "re-encode the video, or extract its frames into rgb/"
 
 
@@ -129,12 +128,13 @@ class VideoFrames(LazyFrames[ImageArray]):
 def _quiet_capture(path: Path) -> Any:
     """Open a video without messages of the decoder on stderr; whoever wants them sets the variable."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.getLogLevel()
-    cv2.setLogLevel(min(level, _ERRORS_ONLY))
+    log = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(min(level, log.LOG_LEVEL_ERROR))
     try:
         return cv2.VideoCapture(str(path), _backend())
     finally:
-        cv2.setLogLevel(level)
+        log.setLogLevel(level)
 
 
 def _backend() -> int:
