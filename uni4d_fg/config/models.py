@@ -7,6 +7,7 @@ from typing import Literal
 from uni4d_fg.config.adam import AdamConfig
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
+from uni4d_fg.config.geometric_depth import AffineDepthConfig, GeometricDepthConfig
 from uni4d_fg.config.incremental import IncrementalConfig
 from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
@@ -52,4 +53,6 @@ class Config(Section):
     incremental: IncrementalConfig = setting(IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.")
     fusion: FusionConfig = setting(FusionConfig(), "Fusion.")
     networks: NetworkConfig = setting(NetworkConfig(), "Networks that make cues.")
+    geometric_depth: GeometricDepthConfig = setting(GeometricDepthConfig(), "Depth from camera motion alone.")
+    affine_depth: AffineDepthConfig = setting(AffineDepthConfig(), "Scale and shift of relative depth networks.")
     output: OutputConfig = setting(OutputConfig(), "Output.")
