@@ -91,6 +91,18 @@ def read_kitti(path: Path) -> Trajectory:
     return Trajectory(np.arange(len(rows), dtype=np.float64), world_T_cam)
 
 
+def write_kitti(path: Path, world_T_cam: FloatArray) -> None:
+    """Write camera-to-world poses (T, 4, 4) as a KITTI odometry trajectory, whole or not at all.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    rows = world_T_cam[:, :3].reshape(-1, 12).tolist()
+    text = "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="ascii")
+
+
 def _read_rows(path: Path, columns: int, expected: str) -> tuple[FloatArray, list[int]]:
     """Return the numbers of a text file (N, columns) and each row's line number."""
     try:

@@ -1,0 +1,70 @@
+"""The verb ``export``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from uni4d_fg.cli import options
+from uni4d_fg.cli.console import print_json
+from uni4d_fg.cli.interruption import Interruption
+from uni4d_fg.cli.progress import progress_reporter
+from uni4d_fg.cli.runs import stored_input
+
+
+class FormatChoice(str, Enum):
+    """Formats of other programs."""
+
+    colmap = "colmap"
+    nerfstudio = "nerfstudio"
+    tum = "tum"
+    kitti = "kitti"
+    ply = "ply"
+    rrd = "rrd"
+    uni4d = "uni4d"
+
+
+def export(
+    run: options.RunPath,
+    to: Annotated[list[FormatChoice], typer.Option("--to", help="Format; may be repeated.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder that gets one folder per format; RUN/export if not given.")
+    ] = None,
+    sequence: Annotated[Path | None, typer.Option(help="The run's sequence, if it was moved.")] = None,
+    masks: Annotated[bool, typer.Option(help="colmap, nerfstudio: masks that hide what moves.")] = True,
+    depth: Annotated[bool, typer.Option("--depth", help="colmap, nerfstudio: dense depth too.")] = False,
+    text: Annotated[bool, typer.Option(help="colmap: the model as text too.")] = True,
+    trajectories: Annotated[bool, typer.Option("--trajectories", help="ply: trajectories, camera path too.")] = False,
+    tail: Annotated[int, typer.Option(help="rrd: past frames that a trajectory shows.", min=1)] = 10,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
+    json: options.Json = False,
+) -> None:
+    """Write a run in the formats of other programs."""
+    from uni4d_fg.export import ExportOptions, export_run
+    from uni4d_fg.export.source import RunSource
+    from uni4d_fg.sequence.model import Sequence
+
+    def open_sequence() -> Sequence:
+        stored = stored_input(run)
+        return (stored if sequence is None else replace(stored, root=str(sequence.resolve()))).read()
+
+    choices = ExportOptions(masks=masks, depth=depth, text=text, trajectories=trajectories, tail=tail)
+    with progress_reporter(quiet or json) as reporter, Interruption() as stop:
+        reports = export_run(
+            RunSource(run, open_sequence), [choice.value for choice in to], out, choices,
+            overwrite=overwrite, reporter=reporter, should_stop=stop,
+        )  # fmt: skip
+    if json:
+        print_json({r.format: {"folder": r.folder, **r.figures, "warnings": r.warnings} for r in reports})
+        return
+    for report in reports:
+        typer.echo(f"{report.format}: {report.folder}")
+        for line in report.facts:
+            typer.echo(f"    {line}")
+        for warning in report.warnings:
+            typer.echo(f"warning: {report.format}: {warning}", err=True)

@@ -1,0 +1,105 @@
+"""Images, masks and depth maps of a run as files for other programs."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import Float32Array, ImageArray
+from uni4d_fg.errors import OutputError
+from uni4d_fg.export.model import ExportJob
+from uni4d_fg.sequence.frames import ImageFolder
+
+JPEG_QUALITY = 95
+MILLIMETRES = 1000.0
+MAX_PNG_DEPTH = 65.534
+"""Metres above which 16-bit millimetres do not reach (65535 is read as missing by many programs)."""
+
+_COPIED_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+def encode(image: npt.NDArray[Any], suffix: str, path: Path) -> bytes:
+    """Return an image (RGB, or one channel) as the bytes of a ``.png`` or ``.jpg`` file.
+
+    Raises:
+        OutputError: If it cannot be encoded; ``path`` is named.
+    """
+    pixels = np.ascontiguousarray(image[:, :, ::-1]) if image.ndim == 3 else image
+    flags = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
+    encoded, data = cv2.imencode(suffix, pixels, flags)
+    if not encoded:
+        raise OutputError(f"cannot write {path}: encoding a {image.shape} image failed; check its size")
+    return data.tobytes()
+
+
+def write_images(job: ExportJob, folder: Path) -> list[str]:
+    """Write every frame into ``folder``: files of the sequence are copied, frames of a video become JPEG.
+
+    A file is copied only if other programs see the same pixels in it as this one does: 8-bit colour.
+
+    Returns:
+        The T file names, in frame order; sorting keeps it.
+    """
+    source = job.source
+    folder.mkdir(parents=True)
+    images = source.sequence.images
+    paths = images.paths if isinstance(images, ImageFolder) else ()
+    # One suffix for all: a mixture could sort differently from the frames.
+    suffixes = {path.suffix for path in paths}
+    if len(suffixes) == 1 and min(suffixes).lower() in _COPIED_SUFFIXES:
+        suffix = suffixes.pop()
+    else:
+        suffix = ".png" if paths else ".jpg"
+    names = [f"{stem}{suffix}" for stem in source.frame_names]
+    for frame, name in enumerate(names):
+        image, target = images[frame], folder / name
+        if paths and paths[frame].suffix == suffix and _is_plain_colour(paths[frame], image):
+            shutil.copyfile(paths[frame], target)
+        else:
+            target.write_bytes(encode(image, ".png" if suffix.lower() == ".png" else ".jpg", target))
+        job.advance(frame + 1)
+    return names
+
+
+def _is_plain_colour(path: Path, image: ImageArray) -> bool:
+    """Tell whether a reader that heeds orientation tags finds the same 8-bit RGB pixels in the file."""
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    raw, upright = cv2.imdecode(data, cv2.IMREAD_UNCHANGED), cv2.imdecode(data, cv2.IMREAD_COLOR)
+    if raw is None or upright is None or raw.shape != image.shape or raw.dtype != np.uint8:
+        return False
+    return np.array_equal(upright[:, :, ::-1], image)
+
+
+def write_masks(job: ExportJob, folder: Path, names: list[str]) -> int:
+    """Write one PNG per frame, 255 where static and 0 where something moves; nothing if nothing ever moves.
+
+    Args:
+        job: The export.
+        folder: Where to write; made if anything is written.
+        names: File names, T.
+
+    Returns:
+        The number of masks written: T or 0.
+    """
+    masks = job.source.sequence.masks
+    if not any(bool((mask > 0).any()) for mask in masks):
+        return 0
+    folder.mkdir(parents=True)
+    for name, mask in zip(names, masks, strict=True):
+        path = folder / name
+        path.write_bytes(encode(np.where(mask > 0, 0, 255).astype(np.uint8), ".png", path))
+        job.check()
+    return len(names)
+
+
+def depth_png(depth: Float32Array, path: Path) -> bytes:
+    """Return a depth map (H, W), metres, as a 16-bit PNG in millimetres; 0 where missing or beyond 65.5 m."""
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(depth) & (depth > 0.0) & (depth <= MAX_PNG_DEPTH)
+    millimetres = np.rint(np.where(known, depth, 0.0).astype(np.float64) * MILLIMETRES)
+    return encode(millimetres.astype(np.uint16), ".png", path)

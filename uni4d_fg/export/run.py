@@ -1,0 +1,119 @@
+"""Exporting a run: all formats asked for are checked first, then written one by one, each whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from uni4d_fg.errors import OutputError
+from uni4d_fg.export.model import ExportJob, ExportOptions, ExportReport
+from uni4d_fg.export.registry import exporter
+from uni4d_fg.export.source import RunSource
+from uni4d_fg.files import atomic_folder, atomic_write_json, temporary_sibling, write_failure
+from uni4d_fg.progress import Reporter, SilentReporter
+
+MARKER = "export.json"
+"""In the folder of every export; says what made it, and that it may be replaced."""
+
+
+def export_run(
+    source: RunSource,
+    formats: Iterable[str],
+    out: Path | None = None,
+    options: ExportOptions | None = None,
+    *,
+    overwrite: bool = False,
+    reporter: Reporter | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> list[ExportReport]:
+    """Write a run in the formats of other programs.
+
+    Args:
+        source: The run.
+        formats: Names in :data:`uni4d_fg.export.registry.FORMATS`.
+        out: Each format gets a folder of its name in here; ``export`` in the run's folder if None.
+        options: Choices.
+        overwrite: Replace earlier exports. A folder that is no export is never touched.
+        reporter: Progress.
+        should_stop: Polled every frame; True ends with :class:`Cancelled`, finished formats kept.
+
+    Returns:
+        One report per format, in the order asked for.
+
+    Raises:
+        InputError: If a format is unknown, or something that it needs is missing or damaged.
+        OutputError: If a folder is in the way, or a file cannot be written. Formats before it are kept.
+        MissingDependencyError: If a format needs a package that is not installed.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    chosen = {name: exporter(name) for name in formats}
+    root = source.folder.root / "export" if out is None else out
+    for name, one in chosen.items():
+        one.require()
+        _check_target(root / name, overwrite)
+        if one.needs_images:
+            _ = source.sequence
+    _ = source.reconstruction
+    reporter = reporter or SilentReporter()
+    return [
+        _export(source, name, root / name, options or ExportOptions(), reporter, should_stop or (lambda: False))
+        for name in chosen
+    ]
+
+
+def _export(
+    source: RunSource,
+    name: str,
+    target: Path,
+    options: ExportOptions,
+    reporter: Reporter,
+    should_stop: Callable[[], bool],
+) -> ExportReport:
+    reporter.begin(name, source.num_frames)
+    # Written beside its place, so that an earlier export stays until the new one is whole.
+    fresh = temporary_sibling(target)
+    with atomic_folder(fresh) as folder:
+        job = ExportJob(source, folder, options, reporter, should_stop)
+        exporter(name).write(job)
+        facts = {"format": name, "run": str(source.folder.root.resolve()), "figures": job.figures, "facts": job.facts}
+        atomic_write_json(folder / MARKER, facts)
+    _replace(fresh, target)
+    reporter.end()
+    return ExportReport(name, target, tuple(job.facts), job.figures, tuple(job.warnings))
+
+
+def _check_target(target: Path, overwrite: bool) -> None:
+    """Raise OutputError if ``target`` is in the way."""
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if not _is_export(target):
+        raise OutputError(f"{target}: exists and is no export; choose another --out")
+    if not overwrite:
+        raise OutputError(f"{target}: exists already; replace it with --overwrite or choose another --out")
+
+
+def _is_export(target: Path) -> bool:
+    try:
+        return bool(json.loads((target / MARKER).read_text(encoding="utf-8")).get("format") == target.name)
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return False
+
+
+def _replace(fresh: Path, target: Path) -> None:
+    """Move a finished folder to its place; what is there goes, or comes back if that fails."""
+    old = temporary_sibling(target)
+    try:
+        if target.exists():
+            os.replace(target, old)
+        os.replace(fresh, target)
+    except OSError as error:
+        if old.exists():
+            with suppress(OSError):
+                os.replace(old, target)
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise write_failure(target, error) from error
+    shutil.rmtree(old, ignore_errors=True)
