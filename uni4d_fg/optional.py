@@ -87,3 +87,22 @@ def import_viser() -> Any:
         raise MissingDependencyError(f"the viewer needs {missing}, not installed: run `{command}`") from error
     except (ImportError, OSError) as error:
         raise MissingDependencyError(f"viser cannot be loaded ({error}): install it anew") from error
+
+
+def import_rerun() -> Any:
+    """Import rerun, which writes ``.rrd`` recordings, when it is first needed.
+
+    Returns:
+        The ``rerun`` module.
+
+    Raises:
+        MissingDependencyError: If the package is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("rerun")
+    except ModuleNotFoundError as error:
+        missing = error.name or "rerun"
+        command = "pip install 'uni4d-fg[export]'" if missing == "rerun" else f"pip install {missing}"
+        raise MissingDependencyError(f"the format rrd needs {missing}, not installed: run `{command}`") from error
+    except (ImportError, OSError) as error:
+        raise MissingDependencyError(f"rerun cannot be loaded ({error}): install it anew") from error

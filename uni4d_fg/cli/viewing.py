@@ -1,0 +1,58 @@
+"""Verbs for looking at a run: ``view``, ``report``."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from uni4d_fg.cli import options
+
+if TYPE_CHECKING:
+    from uni4d_fg.view.opened_run import OpenedRun
+
+
+def view(
+    run: options.RunPath,
+    host: Annotated[str, typer.Option(help="Address to listen at; 0.0.0.0 for other machines as well.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen at.", min=1, max=65535)] = 8080,
+    max_points: Annotated[int, typer.Option(help="Points of the static cloud that are sent.", min=1)] = 400_000,
+) -> None:
+    """Show a run in a browser: cameras, clouds and trajectories over time."""
+    from uni4d_fg.view.content import Limits
+    from uni4d_fg.view.server import viewer_server
+    from uni4d_fg.view.viewer import Viewer
+
+    # Ctrl-C is how a viewer is closed, so that it is no failure.
+    with contextlib.suppress(KeyboardInterrupt):
+        opened = _open(run)
+        with viewer_server(host, port, f"uni4d-fg: {opened.name}") as server:
+            viewer = Viewer(server, opened, Limits(static_points=max_points))
+            shown = f"[{host}]" if ":" in host else host
+            typer.echo(f"{opened.name}: http://{shown}:{port} (Ctrl-C ends)")
+            sys.stdout.flush()
+            viewer.run_until(lambda: False)
+
+
+def report(
+    run: options.RunPath,
+    out: Annotated[
+        Path | None, typer.Option(help="The page; RUN/report.html if not given.", show_default=False)
+    ] = None,
+) -> None:
+    """Write one self-contained HTML page about a run: what was done, how well, and what to distrust."""
+    from uni4d_fg.report.build import write_report
+
+    path = out or run / "report.html"
+    write_report(_open(run), path)
+    typer.echo(f"report: {path}")
+
+
+def _open(run: Path) -> OpenedRun:
+    from uni4d_fg.cli.runs import stored_input
+    from uni4d_fg.view.opened_run import open_run
+
+    return open_run(run, lambda: stored_input(run).read())

@@ -1,0 +1,57 @@
+"""Colours of points and cameras: by value, by instance."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, ImageArray, Int32Array
+
+STATIC_GREY = (150, 156, 164)
+UNKNOWN_GREY = (104, 109, 117)
+BRIDGED_AMBER = (240, 165, 50)
+CURRENT_ORANGE = (255, 122, 26)
+
+_DARKEST = 0.12
+"""The colour map starts here: its first colours cannot be told from a dark background."""
+
+_PALETTE = np.array(
+    [
+        (227, 87, 86), (78, 161, 223), (89, 190, 118), (242, 180, 66), (167, 120, 214), (72, 196, 196),
+        (236, 128, 190), (164, 190, 76), (206, 138, 92), (120, 140, 240), (240, 120, 60), (60, 160, 120),
+    ],
+    dtype=np.uint8,
+)  # fmt: skip
+
+
+def instance_colors(instance: Int32Array) -> ImageArray:
+    """Return a colour per instance id, (..., 3) RGB; 0, the static scene, is grey. Ids keep their colour."""
+    out: ImageArray = _PALETTE[(np.asarray(instance) - 1) % len(_PALETTE)]
+    out[np.asarray(instance) <= 0] = STATIC_GREY
+    return out
+
+
+def value_range(values: FloatArray) -> tuple[float, float]:
+    """Return the range from 0 to the 95th percentile of the finite values, never empty."""
+    finite = np.asarray(values)[np.isfinite(values)]
+    high = float(np.quantile(finite, 0.95)) if finite.size else 1.0
+    return 0.0, high if high > 0.0 else 1.0
+
+
+def value_colors(values: FloatArray, bounds: tuple[float, float]) -> ImageArray:
+    """Return a colour per value, (..., 3) RGB: dark violet at the lower bound, yellow at the upper; grey for NaN."""
+    low, high = bounds
+    values = np.asarray(values, dtype=np.float64)
+    known = ~np.isnan(values)
+    level = np.clip((np.where(known, values, low) - low) / (high - low), 0.0, 1.0)
+    out: ImageArray = np.rint(
+        255.0 * matplotlib.colormaps["plasma"](_DARKEST + (1.0 - _DARKEST) * level)[..., :3]
+    ).astype(np.uint8)
+    out[~known] = UNKNOWN_GREY
+    return out
+
+
+def css_gradient() -> str:
+    """Return the colours of :func:`value_colors` as a CSS gradient from left to right."""
+    stops = value_colors(np.linspace(0.0, 1.0, 7), (0.0, 1.0))
+    return "linear-gradient(to right," + ",".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in stops.tolist()) + ")"
