@@ -125,7 +125,7 @@ def components(labels: npt.NDArray[np.integer], min_area_px: int = 1) -> FrameDe
 
 
 def _worth_keeping(found: FrameDetections, config: InstanceConfig) -> FrameDetections:
-    large = found.masks.reshape(len(found), -1).sum(axis=1) >= config.min_area_px
+    large = found.masks.sum(axis=(1, 2)) >= config.min_area_px
     return found.keep(np.asarray(large & (found.scores >= config.min_score)))
 
 

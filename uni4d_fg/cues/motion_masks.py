@@ -1,0 +1,263 @@
+"""Masks of what moves, from tracks, depth and images alone: for videos without a segmenter.
+
+1. Cameras are solved from all tracks, robustly; tracks that depart from the static scene are found
+   (:mod:`uni4d_fg.cues.track_motion`); cameras are solved once more without them, and the tracks tested again.
+2. Every frame is compared with others before and after it as a static scene would look there
+   (:mod:`uni4d_fg.cues.appearance`). Of the two directions the less suspicious one counts: what is hidden in one is
+   mostly seen in the other.
+3. The evidence of pixels and tracks, and of the frames next to it, is smoothed within surfaces of like colour; regions
+   above a threshold are kept unless their own tracks say that they are static (:mod:`uni4d_fg.cues.moving_regions`).
+4. Regions are joined to instances over time (:mod:`uni4d_fg.cues.instances`); those of few frames are dropped.
+
+What stands still through the whole video is static here, whatever it is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
+from uni4d_fg.config.models import Config
+from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.cues.appearance import FrameAppearance, frame_appearance, moved_evidence
+from uni4d_fg.cues.dense_flow import DenseFlow, shrink, shrunk_size, warp_back, working_scale
+from uni4d_fg.cues.depth_range import spread_at_tracks
+from uni4d_fg.cues.detections import FrameDetections
+from uni4d_fg.cues.instances import associate_instances
+from uni4d_fg.cues.label_store import CompressedLabels
+from uni4d_fg.cues.moving_regions import moving_region, track_evidence, trusted_components
+from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
+from uni4d_fg.cues.static_scene import relative_pose
+from uni4d_fg.cues.track_motion import Cameras, SharedError, TrackMotion, find_moving_tracks
+from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.sequence.model import FrameSource, Video
+from uni4d_fg.tracks.model import Tracks
+
+_MOST_MAY_MOVE = 0.6
+
+
+@dataclass(frozen=True)
+class MotionMasks:
+    """Masks from motion, and what was found on the way."""
+
+    labels: FrameSource[Int32Array]
+    """T maps (H, W): 0 static, otherwise the number of an instance that moves, the same in all frames."""
+    cameras: Cameras
+    """Those the masks were made with; good to start from, not a result."""
+    tracks: TrackMotion
+    """Which tracks move."""
+    facts: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def motion_masks(
+    video: Video,
+    depths: FrameSource[Float32Array],
+    tracks: Tracks,
+    intrinsics: FloatArray,
+    config: MotionMaskConfig,
+    reporter: Reporter | None = None,
+    should_stop: Callable[[], bool] | None = None,
+    solver: Config | None = None,
+) -> MotionMasks:
+    """Find what moves in a video by comparing it with a static scene.
+
+    Args:
+        video: Images.
+        depths: T maps (H, W), of any one scale; NaN where missing.
+        tracks: K tracks over the T frames, over the whole image.
+        intrinsics: (4,) px, known or to start from.
+        config: Sigmas, thresholds and sizes.
+        reporter: Progress.
+        should_stop: Polled often.
+        solver: Stages 1 and 2 and their minimiser; None takes the defaults.
+
+    Raises:
+        InputError: If depth or tracks do not fit the images.
+        DegenerateProblemError: If the tracks do not determine the cameras.
+        SolverError: If the cameras cannot be solved.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    report, stop = reporter or SilentReporter(), should_stop or (lambda: False)
+    for name, count in (("depth maps", len(depths)), ("frames of tracks", tracks.num_frames)):
+        if count != video.num_frames:
+            raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
+    settings = solver or Config()
+    report.begin("motion of tracks", 2)
+    cameras, motion = _tracks_and_cameras(video, depths, tracks, intrinsics, config, settings, report, stop)
+    report.end()
+    report.begin("motion masks", video.num_frames)
+    comparison = _Comparison(video, depths, tracks, cameras, motion, config)
+    labels = CompressedLabels(video.image_size)
+    seen_in: dict[int, int] = {}
+    area = 0.0
+    found = comparison.detections(stop)
+    for frame, numbers in enumerate(associate_instances(found, video.images, config.instances, stop)):
+        labels.append(numbers)
+        for number in np.unique(numbers[numbers > 0]).tolist():
+            seen_in[number] = seen_in.get(number, 0) + 1
+        report.advance(frame + 1)
+    kept = sorted(n for n, count in seen_in.items() if count >= min(config.min_frames, video.num_frames))
+    new_ids = np.zeros(max(seen_in, default=0) + 1, np.int32)
+    new_ids[kept] = np.arange(1, len(kept) + 1)
+    labels.rename(new_ids)
+    area = float(np.mean([np.count_nonzero(numbers) / numbers.size for numbers in labels]))
+    report.end()
+    facts = [
+        f"{len(kept)} instances move, {100 * area:.1f} % of the image; {int(motion.moving.sum())} tracks move, "
+        f"{int(motion.static.sum())} are static, {int((~motion.moving & ~motion.static).sum())} undecided"
+    ]
+    return MotionMasks(labels, cameras, motion, facts, _warnings(motion, area))
+
+
+def _warnings(motion: TrackMotion, area: float) -> list[str]:
+    decided = int(motion.moving.sum() + motion.static.sum())
+    if area > _MOST_MAY_MOVE or (decided and motion.moving.sum() > _MOST_MAY_MOVE * decided):
+        return [
+            "motion masks: most of the image seems to move, so that what was taken for the static scene may be a moving "
+            "thing; give masks if the cameras look wrong"
+        ]
+    return []
+
+
+def _tracks_and_cameras(
+    video: Video,
+    depths: FrameSource[Float32Array],
+    tracks: Tracks,
+    intrinsics: FloatArray,
+    config: MotionMaskConfig,
+    settings: Config,
+    report: Reporter,
+    stop: Callable[[], bool],
+) -> tuple[Cameras, TrackMotion]:
+    """Solve cameras, test tracks, and do both once more without the tracks that move."""
+    known = StaticTracks.of(video, depths, tracks, intrinsics, settings)
+    spread = spread_at_tracks(known.labelled.tracks, depths, max(1, round(config.depth_edge_px)))
+    moving = np.zeros(tracks.num_tracks, bool)
+    cameras, motion = None, None
+    for turn in range(2):
+        cameras = solve_cameras(
+            known.without(moving),
+            intrinsics,
+            settings,
+            free_intrinsics=config.free_intrinsics,
+            observations_per_frame=config.max_bundle_observations,
+            should_stop=stop,
+        )
+        motion = find_moving_tracks(known.labelled, spread, cameras, video.image_size, config)
+        moving = motion.moving
+        report.advance(turn + 1)
+    assert cameras is not None
+    assert motion is not None
+    return cameras, motion
+
+
+class _Comparison:
+    """Frames compared with those around them; a window of frames is held."""
+
+    def __init__(
+        self,
+        video: Video,
+        depths: FrameSource[Float32Array],
+        tracks: Tracks,
+        cameras: Cameras,
+        motion: TrackMotion,
+        config: MotionMaskConfig,
+    ) -> None:
+        self.video, self.depths, self.tracks = video, depths, tracks
+        self.cameras, self.motion, self.config = cameras, motion, config
+        self.size = shrunk_size(video.image_size, working_scale(video.image_size, config.working_size_px))
+        # Pixel centres are integers: (u + 1/2) scales.
+        self.scale = np.array([self.size[1] / video.image_size[1], self.size[0] / video.image_size[0]])
+        fx, fy, cx, cy = cameras.intrinsics
+        sx, sy = self.scale
+        self.intrinsics = np.array([fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5])
+        self.images: dict[int, ImageArray] = {}
+        self.frames: dict[int, FrameAppearance] = {}
+        self.flow = DenseFlow()
+
+    def detections(self, stop: Callable[[], bool]) -> Iterator[FrameDetections]:
+        """Yield the regions that move, frame by frame."""
+        count = self.video.num_frames
+        window: deque[Float32Array] = deque()  # evidence of the frame before, of this one, and of the next
+        for frame in range(count + 1):
+            if stop():
+                raise Cancelled("stopped while comparing frames for the motion masks")
+            if frame < count:
+                window.append(self._evidence(frame))
+            if frame == 0:
+                continue
+            this = frame - 1
+            near = {this - 1 + n + (0 if this else 1): evidence for n, evidence in enumerate(window)}
+            yield self._regions(this, near)
+            if this > 0:
+                window.popleft()
+            self._forget_before(this - max(self.config.baselines))
+
+    def _frame(self, frame: int) -> FrameAppearance:
+        if frame not in self.frames:
+            height, width = self.size
+            image = shrink(self.video.images[frame], self.size)
+            depth = cv2.resize(self.depths[frame], (width, height), interpolation=cv2.INTER_NEAREST)
+            edge = max(1, round(self.config.depth_edge_px * float(self.scale.mean())))
+            self.images[frame] = image
+            self.frames[frame] = frame_appearance(image, depth, float(self.cameras.log_scale[frame]), edge)
+        return self.frames[frame]
+
+    def _forget_before(self, frame: int) -> None:
+        for kept in (self.frames, self.images):
+            for old in [f for f in kept if f < frame]:
+                del kept[old]
+
+    def _evidence(self, frame: int) -> Float32Array:
+        total, count = np.zeros(self.size, np.float32), 0
+        for step in self.config.baselines:
+            sides = [self._pair(frame, f) for f in (frame - step, frame + step) if 0 <= f < self.video.num_frames]
+            if sides:
+                total += np.minimum.reduce(sides)
+                count += 1
+        if count:
+            total *= len(self.config.baselines) / count
+        tracks = track_evidence(self.tracks, self.motion, frame, self.size, self.scale)
+        return total + np.float32(self.config.track_weight) * tracks
+
+    def _pair(self, source: int, target: int) -> Float32Array:
+        shared = self._shared(self.motion.shared.get((source, target)))
+        pose = relative_pose(self.cameras.world_T_cam, source, target)
+        return moved_evidence(
+            self._frame(source), self._frame(target), pose, self.intrinsics, shared, self.config
+        )  # fmt: skip
+
+    def _shared(self, error: SharedError | None) -> tuple[Float32Array, Float32Array]:
+        if error is None:
+            return np.zeros(self.size, np.float32), np.zeros(self.size, np.float32)
+        sx, sy = self.scale
+        columns = (np.arange(self.size[1]) + 0.5) / sx - 0.5
+        rows = (np.arange(self.size[0]) + 0.5) / sy - 0.5
+        u, v = np.meshgrid(columns, rows)
+        x, y = error.at(u, v)
+        return (x * sx).astype(np.float32), (y * sy).astype(np.float32)
+
+    def _regions(self, frame: int, near: dict[int, Float32Array]) -> FrameDetections:
+        evidence, weight = near[frame].copy(), self.config.neighbour_frames_weight
+        others = [f for f in near if f != frame]
+        if weight > 0 and others:
+            grey = self._grey(frame)
+            for other in others:
+                flow = self.flow.between(grey, self._grey(other))
+                evidence += weight * warp_back(near[other], flow)
+            evidence /= 1 + weight * len(others)
+        self._frame(frame)
+        region = moving_region(evidence, self.images[frame], self.video.image_size, self.config)
+        masks: BoolArray = trusted_components(region, self.tracks, self.motion, frame, self.config)
+        return FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
+
+    def _grey(self, frame: int) -> ImageArray:
+        self._frame(frame)
+        return np.asarray(cv2.cvtColor(self.images[frame], cv2.COLOR_RGB2GRAY))
