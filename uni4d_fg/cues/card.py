@@ -143,7 +143,9 @@ class SegmentationOutputs(Section):
     activation: Literal["none", "sigmoid", "softmax"] = setting(
         "none", "Of 'semantic': what turns the output into probabilities; 'none' where it holds them."
     )
-    candidates: str = setting("output0", "Of 'yolo_seg': (1, 4 + C + M, A): box centre and size, classes, coefficients.")
+    candidates: str = setting(
+        "output0", "Of 'yolo_seg': (1, 4 + C + M, A): box centre and size, classes, coefficients."
+    )
     prototypes: str = setting("output1", "Of 'yolo_seg': (1, M, h, w).")
     boxes: str = setting("boxes", "Of 'masks': (N, 4) x0, y0, x1, y1, px at the network's size.")
     labels: str = setting("labels", "Of 'masks': (N,) numbers of classes.")
@@ -187,9 +189,7 @@ class TrackOutputs(Section):
     visibility_kind: Literal["probability", "logit", "occlusion_logit"] = required("What it holds.")
     confidence: str = setting("", "Output that says how sure the position is; empty: none.")
     confidence_kind: Literal["probability", "logit", "error_logit"] = setting("probability", "What it holds.")
-    min_probability: float = setting(
-        0.5, "Seen where visibility times confidence is at least this.", ge=0, le=1
-    )
+    min_probability: float = setting(0.5, "Seen where visibility times confidence is at least this.", ge=0, le=1)
 
 
 class TracksCard(BaseCard):
@@ -260,9 +260,7 @@ def load_card(path: Path) -> Card:
         raise ConfigError(f"{path}: holds {type(values).__name__}, but a model card is a mapping of fields")
     model = _MODELS.get(str(values.get("kind")))
     if model is None:
-        raise ConfigError(
-            f"{path}: kind: got {values.get('kind')!r}, but one of {', '.join(_MODELS)} is expected"
-        )
+        raise ConfigError(f"{path}: kind: got {values.get('kind')!r}, but one of {', '.join(_MODELS)} is expected")
     card: Any = build_section(model, values, lambda _: str(path))
     return card  # type: ignore[no-any-return]
 

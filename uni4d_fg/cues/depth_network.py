@@ -141,5 +141,3 @@ class DepthNetwork:
                 focal = 0.5 * width / np.tan(0.5 * angle) if 0 < angle < np.pi else np.nan
             found = np.array([focal, focal, *centre])
         return None if not np.isfinite(found).all() or implausible(found, placement.image_size) else found
-
-
