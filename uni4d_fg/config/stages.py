@@ -102,6 +102,13 @@ class BundleAdjustmentConfig(Section):
     drift_frames: float = setting(
         30.0, "A track's observation this many frames from its query frame has twice the variance (tracks drift).", gt=0
     )
+    covariance_cells: int = setting(
+        8,
+        "Static tracks that start in the same cell, of this many along the longer image side, are taken to err alike in "
+        "the covariances of the cameras, in whatever way they do; 0 takes all observations for independent.",
+        ge=0,
+        le=64,
+    )
     structure: Literal["refine", "relift", "keep"] = setting(
         "refine",
         "Landmarks after the solve. 'refine': solve them and the frames' scales once more with frozen cameras and "
@@ -195,6 +202,13 @@ class FusionConfig(Section):
         gt=0,
     )
     stride: int = setting(4, "Scales are interpolated on a grid of this spacing and bilinearly in between, px.", ge=1)
+    averaged_offsets: tuple[int, ...] = setting(
+        (1, 2, 4, 6, 8),
+        "Static depth is averaged with that of the frames this far before and after; empty leaves it out.",
+    )
+    max_disagreement: float = setting(
+        0.05, "... where its logarithm differs from theirs, seen from there, by less than this.", gt=0
+    )
     edge_relative_gradient: float = setting(
         0.05, "Pixels whose depth changes by more than this part per pixel are left out of the clouds.", gt=0
     )

@@ -65,6 +65,26 @@ class Kernel:
             result = 1.0 / np.sqrt(squared + c * c)
         return result
 
+    def slope(self, squared: FloatArray, dim: int) -> FloatArray:
+        """Return the slope of ``w(s) r`` with respect to a residual r of ``dim`` entries, averaged over directions.
+
+        ``w + s w'(s) / dim``; same shape as ``squared``. It is what curvature a robust term truly has (Huber 1981),
+        where the weight is what reweighted least squares uses.
+        """
+        c, w = self.threshold, self.weight(squared)
+        result: FloatArray
+        if self.kind == "quadratic":
+            result = w
+        elif self.kind == "huber":
+            result = np.where(squared <= c * c, 1.0, w * (1.0 - 1.0 / dim))
+        elif self.kind == "pseudo_huber":
+            result = w - squared / (c * c) * w**3 / dim
+        elif self.kind == "cauchy":
+            result = w - 2.0 * squared / (c * c) * w**2 / dim
+        else:
+            result = w - squared * w**3 / dim
+        return result
+
     def square_root(self, squared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the scale a(s) for which |a r|^2 / 2 = rho(s), and (da/ds) / s; both finite at zero.
 

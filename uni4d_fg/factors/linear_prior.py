@@ -18,6 +18,8 @@ from uni4d_fg.factors.family import FactorFamily
 from uni4d_fg.geometry import se3
 from uni4d_fg.graph.state import TANGENT_DIM
 
+LINEAR_PRIOR = "linear_prior"
+"""Name of every such family."""
 _SMALL_ANGLE = 1e-4
 
 
@@ -89,4 +91,4 @@ def linear_prior_family(variables: tuple[str, ...]) -> FactorFamily:
             start = stop
         return np.einsum("nij,nj->ni", data["root"], d) + data["offset"], jacobians
 
-    return FactorFamily("linear_prior", variables, ("root", "offset", *names), size, residual, linearize)
+    return FactorFamily(LINEAR_PRIOR, variables, ("root", "offset", *names), size, residual, linearize)

@@ -16,6 +16,7 @@ from uni4d_fg.factors.batch import FactorBatch, Slot
 from uni4d_fg.factors.linear_prior import linear_prior_family
 from uni4d_fg.incremental.model import DynamicPoints, FinishedFrame, FrameStatus, Landmarks
 from uni4d_fg.incremental.reconstructor import IncrementalReconstructor, PendingFrame
+from uni4d_fg.solve.clustered import Spread
 from uni4d_fg.stages.bundle_adjustment import StaticNoise
 from uni4d_fg.stages.observations import Observations
 
@@ -44,6 +45,8 @@ def state_arrays(solver: IncrementalReconstructor) -> Arrays:
     if window.prior is not None:
         out |= {f"prior_{name}": array for name, array in window.prior.data.items()}
         out["prior_variables"] = np.array([slot.group for slot in window.prior.slots])
+        if window.spread is not None:
+            out["prior_scores"], out["prior_rest"] = window.spread.scores, window.spread.rest
         out["prior_rows"] = np.array([int(slot.rows[0]) for slot in window.prior.slots])
     out |= {f"dynamic_{name}": getattr(dynamic, name) for name in ("frame", "pose", "instance")}
     out |= {f"dynamic_observed_{name}": getattr(dynamic.observations, name) for name in _OBSERVATIONS}
@@ -92,6 +95,8 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
         slots = tuple(Slot(group, np.array([row])) for group, row in zip(variables, rows, strict=True))
         data = {name: arrays[f"prior_{name}"] for name in family.data}
         window.prior = FactorBatch.create(family, slots, data)
+        if "prior_scores" in arrays:
+            window.spread = Spread(arrays["prior_scores"], arrays["prior_rest"])
     for name in ("frame", "pose", "instance"):
         setattr(dynamic, name, arrays[f"dynamic_{name}"])
     dynamic.observations = Observations(*(arrays[f"dynamic_observed_{name}"] for name in _OBSERVATIONS))

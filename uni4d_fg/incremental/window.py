@@ -25,8 +25,8 @@ from uni4d_fg.factors.batch import FactorBatch, Slot
 from uni4d_fg.factors.linear_prior import linear_prior_family
 from uni4d_fg.graph.state import State, VariableNames
 from uni4d_fg.incremental.labels import LabelledFrame
-from uni4d_fg.solve.marginalisation import marginalise
-from uni4d_fg.solve.marginals import camera_marginals
+from uni4d_fg.solve.clustered import Clusters, Spread
+from uni4d_fg.solve.marginalisation import marginalise_with_spread
 from uni4d_fg.stages.bundle_adjustment import (
     Freedom,
     StaticNoise,
@@ -35,6 +35,8 @@ from uni4d_fg.stages.bundle_adjustment import (
     landmark_errors,
     measure_noise,
     reprojection_residual,
+    static_marginals,
+    track_cells,
 )
 from uni4d_fg.stages.lifting import frame_log_scales, lift, mean_per_row
 from uni4d_fg.stages.observations import Observations
@@ -96,6 +98,8 @@ class CameraWindow:
     """(N,) ascending."""
     landmark: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     prior: FactorBatch | None = None
+    spread: Spread | None = None
+    """Of the prior's gradient, on the columns of its slots."""
     slides: int = 0
     """Keyframes that have left."""
     intrinsics_free: bool = True
@@ -143,8 +147,8 @@ class CameraWindow:
 
     def update_covariance(self) -> None:
         """Compute the marginal covariances at the present state."""
-        state, _, stage = self._stage()
-        marginals = camera_marginals(stage.problem, state, stage.solver)
+        state, used, stage = self._stage()
+        marginals = static_marginals(stage, state, self._clusters(used), self.spread)
         if marginals is None:
             self.covariance = np.full((len(self), 6, 6), np.nan)
             return
@@ -161,7 +165,7 @@ class CameraWindow:
         state, used, stage = self._stage()
         leaving_landmark = self._leaving_landmarks(used)
         left = self._hand_over(state, used, leaving_landmark)
-        self.prior = self._reduce(stage, state, leaving_landmark)
+        self.prior, self.spread = self._reduce(stage, state, used, leaving_landmark)
         oldest = LeftKeyframe(int(self.frame[0]), self.pose[0], self.covariance[0], float(self.log_scale[0]))
         gone = np.isin(self.observations.track, self.landmark_track[leaving_landmark]) | (self.observations.frame == 0)
         kept = self.observations.select(~gone)
@@ -326,7 +330,18 @@ class CameraWindow:
         count = np.bincount(chosen.track, minlength=len(leaving))[rows]
         return LeftLandmarks(self.landmark_track[rows], self.landmark[rows], np.asarray(error, np.float64), count)
 
-    def _reduce(self, stage: Stage, state: State, leaving: BoolArray) -> FactorBatch | None:
+    def _clusters(self, used: Observations) -> Clusters | None:
+        """Put the landmarks into clusters; the cells are those of the given intrinsics, the same for all time."""
+        found = track_cells(used, self.prior_intrinsics, self.config.bundle_adjustment)
+        if found is None:
+            return None
+        cells = np.zeros(len(self.landmark_track), dtype=np.int64)
+        cells[np.unique(used.track)] = found.of_landmark
+        return replace(found, of_landmark=cells)
+
+    def _reduce(
+        self, stage: Stage, state: State, used: Observations, leaving: BoolArray
+    ) -> tuple[FactorBatch | None, Spread | None]:
         """Return the prior that the oldest keyframe and its landmarks leave, on rows that have moved up by one."""
 
         def touches(batch: FactorBatch) -> BoolArray:
@@ -349,11 +364,17 @@ class CameraWindow:
         batches = tuple(_renumbered(batch, "landmark", lambda r: place[r]) for batch in batches)
         part = state.replace(landmark=state["landmark"][rows])
         oldest = np.arange(len(self)) == 0
-        prior = marginalise(batches, part, free, {"pose": oldest, "log_scale": oldest}, stage.solver)
-        if prior is None:
-            return None
-        prior = _renumbered(prior, "pose", lambda r: r - 1)
-        return _renumbered(prior, "log_scale", lambda r: r - 1)
+        clusters = self._clusters(used)
+        if clusters is not None:
+            clusters = replace(clusters, of_landmark=clusters.of_landmark[rows])
+        found = marginalise_with_spread(
+            batches, part, free, {"pose": oldest, "log_scale": oldest}, stage.solver,
+            clusters=clusters, carried=self.spread,
+        )  # fmt: skip
+        if found is None:
+            return None, None
+        prior = _renumbered(found[0], "pose", lambda r: r - 1)
+        return _renumbered(prior, "log_scale", lambda r: r - 1), found[1]
 
 
 def _renumbered(batch: FactorBatch, group: str, rows: Callable[[IntArray], IntArray]) -> FactorBatch:

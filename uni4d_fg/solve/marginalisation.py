@@ -27,6 +27,7 @@ from uni4d_fg.factors.batch import FactorBatch, Slot
 from uni4d_fg.factors.linear_prior import linear_prior_family
 from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import State
+from uni4d_fg.solve.clustered import Clusters, Spread, gradient_spread
 from uni4d_fg.solve.marginals import reduced_hessian
 from uni4d_fg.solve.threads import one_blas_thread
 
@@ -58,7 +59,22 @@ def marginalise(
     config: SolverConfig,
     eliminate: str | None = "landmark",
 ) -> FactorBatch | None:
-    """Turn factors into a linear prior on the variables that stay.
+    """Turn factors into a linear prior on the variables that stay, see :func:`marginalise_with_spread`."""
+    found = marginalise_with_spread(batches, state, free, leaving, config, eliminate)
+    return None if found is None else found[0]
+
+
+def marginalise_with_spread(
+    batches: tuple[FactorBatch, ...],
+    state: State,
+    free: Mapping[str, BoolArray],
+    leaving: Mapping[str, BoolArray],
+    config: SolverConfig,
+    eliminate: str | None = "landmark",
+    clusters: Clusters | None = None,
+    carried: Spread | None = None,
+) -> tuple[FactorBatch, Spread | None] | None:
+    """Turn factors into a linear prior on the variables that stay, and say how uncertain it is.
 
     Args:
         batches: The factors to use up: every one that reads a leaving variable, and no other.
@@ -68,9 +84,12 @@ def marginalise(
         leaving: Rows (n,) per camera group that leave.
         config: Options of the solver.
         eliminate: Group of points that leave.
+        clusters: Which of these points may err alike.
+        carried: Spread of a linear prior among the batches, on the columns of its slots.
 
     Returns:
-        A batch of one factor on the rows that stay and that the information touches; None if there is none.
+        A batch of one factor on the rows that stay and that the information touches, and the spread of its gradient
+        on the columns of its slots (None without clusters); None if there is no such row.
 
     Raises:
         SolverError: If a factor is not finite.
@@ -93,7 +112,7 @@ def marginalise(
     stay = np.flatnonzero(~is_leaving & touched)
     if len(stay) == 0:
         return None
-    information, slope = _eliminate(hessian, gradient, stay, out)
+    information, slope, step = _eliminate(hessian, gradient, stay, out)
     variables: list[tuple[str, int]] = sorted({layout.locate(column)[:2] for column in stay.tolist()})
     columns = np.concatenate([layout.columns(group, np.array([row])).reshape(-1) for group, row in variables])
     place = np.searchsorted(stay, columns)
@@ -105,7 +124,14 @@ def marginalise(
     slots = tuple(Slot(group, np.array([row])) for group, row in variables)
     points = {f"point_{i}": state[group][[row]].copy() for i, (group, row) in enumerate(variables)}
     family = linear_prior_family(tuple(group for group, _ in variables))
-    return FactorBatch.create(family, slots, {"root": root[None], "offset": offset[None], **points})
+    prior = FactorBatch.create(family, slots, {"root": root[None], "offset": offset[None], **points})
+    if clusters is None or eliminate is None:
+        return prior, None
+    spread = gradient_spread(batches, state, layout, clusters, eliminate, carried, as_prior=True)
+    onto = np.zeros((layout.size, len(columns)))
+    onto[stay[place[at]], at] = 1.0
+    onto[np.ix_(out, at)] = -step[:, place[at]]
+    return prior, spread.project(onto)
 
 
 def _with_points(batch: FactorBatch, known: BoolArray, group: str) -> FactorBatch:
@@ -116,20 +142,22 @@ def _with_points(batch: FactorBatch, known: BoolArray, group: str) -> FactorBatc
 
 def _eliminate(
     hessian: FloatArray, gradient: FloatArray, stay: IntArray, out: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the Schur complement and its gradient on the columns that stay.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the Schur complement and its gradient on the columns that stay, and ``H_oo^{-1} H_os``.
 
     Leaving directions that no factor determines are left out of the inverse: they carry nothing.
     """
     information, slope = hessian[np.ix_(stay, stay)], gradient[stay]
+    step = np.zeros((len(out), len(stay)))
     if len(out) == 0:
-        return information, slope
+        return information, slope, step
     with one_blas_thread():
         _, inverse, offset = _square_root(hessian[np.ix_(out, out)], gradient[out])
         link = inverse.T @ hessian[np.ix_(out, stay)]
         information = information - link.T @ link
         slope = slope - link.T @ offset
-    return 0.5 * (information + information.T), slope
+        step = inverse @ link
+    return 0.5 * (information + information.T), slope, step
 
 
 def _square_root(information: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

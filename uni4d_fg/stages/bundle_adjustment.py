@@ -22,7 +22,8 @@ from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 from uni4d_fg.graph.state import State, VariableNames
 from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.solve.marginals import camera_marginals
+from uni4d_fg.solve.clustered import Clusters, Spread, clustered_marginals, image_cells
+from uni4d_fg.solve.marginals import CameraMarginals, camera_marginals
 from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.lifting import lift, mean_per_row
 from uni4d_fg.stages.noise import intraclass_correlation, robust_sigma
@@ -259,7 +260,7 @@ def adjust_bundle(
         if config.depth_prior and freedom.poses:
             state = _hold_metric_scale(state)
         if index == rounds - 1 and not unsquared:
-            pose_covariance, intrinsics_covariance = _covariances(stage, state)
+            pose_covariance, intrinsics_covariance = _covariances(stage, state, observations, config)
         state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
             counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)
@@ -301,12 +302,35 @@ def unknown_covariances(num_frames: int) -> tuple[FloatArray, FloatArray]:
     return np.full((num_frames, 6, 6), np.nan), np.full((4, 4), np.nan)
 
 
-def _covariances(stage: Stage, state: State) -> tuple[FloatArray, FloatArray]:
+def _covariances(
+    stage: Stage, state: State, observations: Observations, config: BundleAdjustmentConfig
+) -> tuple[FloatArray, FloatArray]:
     """Return the marginal covariances at the end of a MAP solve; the paper's norms are no likelihood."""
-    marginals = camera_marginals(stage.problem, state, stage.solver, stage.eliminate)
+    marginals = static_marginals(stage, state, track_cells(observations, state["intrinsics"][0], config))
     if marginals is None:
         return unknown_covariances(len(state["pose"]))
     return marginals.blocks("pose", len(state["pose"])), marginals.blocks("intrinsics", 1)[0]
+
+
+def track_cells(
+    observations: Observations, intrinsics: FloatArray, config: BundleAdjustmentConfig
+) -> Clusters | None:
+    """Put tracks, in ascending order, into clusters by the image cell of their first observation; None if off."""
+    if config.covariance_cells == 0:
+        return None
+    order = np.lexsort([observations.frame, observations.track])
+    _, first = np.unique(observations.track[order], return_index=True)
+    cells = image_cells(observations.uv[order[first]], intrinsics, config.covariance_cells)
+    return Clusters(cells, config.covariance_cells**2)
+
+
+def static_marginals(
+    stage: Stage, state: State, clusters: Clusters | None, carried: Spread | None = None
+) -> CameraMarginals | None:
+    """Return the joint covariance of the cameras of a stage, with or without clusters of landmarks."""
+    if clusters is None or stage.eliminate is None:
+        return camera_marginals(stage.problem, state, stage.solver, stage.eliminate)
+    return clustered_marginals(stage.problem, state, stage.solver, clusters, stage.eliminate, carried)
 
 
 def _hold_metric_scale(state: State) -> State:
