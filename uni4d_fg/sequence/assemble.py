@@ -9,6 +9,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
 from uni4d_fg.files import load_npz
 from uni4d_fg.sequence.calibration import VaryingIntrinsics, guess_intrinsics, load_intrinsics
+from uni4d_fg.sequence.decode import check_bit_depth
 from uni4d_fg.sequence.frames import DepthFolder, ImageFolder, LazyFrames, MaskFolder, NpyDepth, no_masks
 from uni4d_fg.sequence.layout import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MASK_SUFFIXES, SequenceFiles, list_frames
 from uni4d_fg.sequence.model import GroundTruth, Sequence, Video
@@ -28,7 +29,10 @@ def open_images(path: Path, stop: int | None = None) -> ImageFolder | VideoFrame
     """
     if path.is_file():
         return VideoFrames(path, stop)
-    return ImageFolder(list_frames(path, IMAGE_SUFFIXES))
+    paths = list_frames(path, IMAGE_SUFFIXES)
+    images = ImageFolder(paths)
+    check_bit_depth(paths[0])
+    return images
 
 
 def open_depth(path: Path, size: tuple[int, int] | None, units_per_metre: float = 1000.0) -> DepthFolder | NpyDepth:

@@ -14,8 +14,12 @@ _MATROSKA_SEGMENT = b"\x18\x53\x80\x67"
 
 def missing_bytes(path: Path) -> int:
     """Return how many bytes the container announces beyond the end of the file; 0 if it is whole or says nothing."""
-    size = path.stat().st_size
-    with open(path, "rb") as stream:
+    try:
+        stream = open(path, "rb")  # noqa: SIM115 - closed below; only the opening may fail without notice
+    except OSError:
+        return 0
+    with stream:
+        size = path.stat().st_size
         start = stream.read(12)
         if start[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
             end = _end_of_boxes(stream, size)

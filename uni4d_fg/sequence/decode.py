@@ -16,6 +16,9 @@ from uni4d_fg.sequence.problems import SequenceProblem
 SATURATED = 65535
 """Value of a 16-bit depth file that means "too far to say"; read as missing."""
 
+MIN_16_BIT_RANGE = 4096
+"""A 16-bit video whose first image stays below this is taken for one of fewer bits, which would come out black."""
+
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
@@ -29,8 +32,8 @@ def _cut_short(data: bytes) -> bool:
     return False
 
 
-def _decode(path: Path) -> npt.NDArray[Any]:
-    """Return the pixels of an image file as they are stored: (H, W) or (H, W, channels), channels BGR(A)."""
+def _decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> npt.NDArray[Any]:
+    """Return the pixels of an image file: (H, W) or (H, W, channels), channels BGR(A); by default as stored."""
     remedy = "replace the file or export it again"
     try:
         data = path.read_bytes()
@@ -41,7 +44,7 @@ def _decode(path: Path) -> npt.NDArray[Any]:
     if _cut_short(data):
         raise SequenceProblem(path, f"is cut short ({len(data)} bytes)", remedy)
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as error:
         raise SequenceProblem(path, "cannot be decoded as an image", remedy) from error
     if pixels is None:
@@ -50,10 +53,10 @@ def _decode(path: Path) -> npt.NDArray[Any]:
 
 
 def read_image(path: Path) -> ImageArray:
-    """Read a colour image.
+    """Read a colour image, upright.
 
-    Grey images become RGB, 16-bit images are scaled to 8 bits, alpha is dropped, and an orientation tag is
-    ignored, so that pixels stay where depth, masks and tracks expect them.
+    Grey images become RGB, 16-bit images are scaled to 8 bits, alpha is dropped, and an EXIF orientation is
+    applied, as every viewer does.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -61,16 +64,26 @@ def read_image(path: Path) -> ImageArray:
     Raises:
         InputError: If the file cannot be decoded or holds something else than 8 or 16 bits per channel.
     """
-    pixels = _decode(path)
+    pixels = _decode(path, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
     if pixels.dtype == np.uint16:
         pixels = np.rint(pixels / 257.0).astype(np.uint8)
     if pixels.dtype != np.uint8:
         raise SequenceProblem(path, f"has pixels of type {pixels.dtype}", "save it with 8 bits per channel")
     if pixels.ndim == 2:
         return np.repeat(pixels[:, :, None], 3, axis=2)
-    if pixels.shape[2] == 2:
-        return np.repeat(pixels[:, :, :1], 3, axis=2)
-    return np.ascontiguousarray(pixels[:, :, 2::-1])
+    return np.ascontiguousarray(pixels[:, :, ::-1])
+
+
+def check_bit_depth(path: Path) -> None:
+    """Raise InputError if a 16-bit image, the first of a video, uses so few of its values that it would be black."""
+    pixels = _decode(path, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+    brightest = int(pixels.max(initial=0))
+    if pixels.dtype == np.uint16 and brightest < MIN_16_BIT_RANGE:
+        raise SequenceProblem(
+            path,
+            f"is a 16-bit image whose brightest value is {brightest} of 65535, next to black",
+            "scale all images by one factor to the whole range, or save them with 8 bits",
+        )
 
 
 def clean_depth(depth: npt.NDArray[Any]) -> Float32Array:

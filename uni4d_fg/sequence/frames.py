@@ -82,7 +82,8 @@ class FileFrames(LazyFrames[T]):
     def _read(self, frame: int) -> T:
         array = self._decode(self.paths[frame])
         if array.shape[:2] != self.size:
-            raise _wrong_size(self.paths[frame], (array.shape[0], array.shape[1]), self.size)
+            found = (array.shape[0], array.shape[1])
+            raise _wrong_size(self.paths[frame], found, self.size, is_cue=not isinstance(self, ImageFolder))
         return array
 
 
@@ -219,9 +220,12 @@ def no_masks(size: tuple[int, int], length: int) -> ConstantFrames[Int32Array]:
     return ConstantFrames(np.zeros(size, dtype=np.int32), length)
 
 
-def _wrong_size(path: Path, found: tuple[int, int], expected: tuple[int, int]) -> SequenceProblem:
+def _wrong_size(path: Path, found: tuple[int, int], expected: tuple[int, int], is_cue: bool = True) -> SequenceProblem:
+    turned = is_cue and found == expected[::-1]
     return SequenceProblem(
         path,
         f"is {found[1]} x {found[0]} px, but the first image is {expected[1]} x {expected[0]} px",
-        "bring all frames and cues to one size (and the intrinsics with them)",
+        "images are turned upright as their files say: make cues from upright images, or remove the orientation flag"
+        if turned
+        else "bring all frames and cues to one size (and the intrinsics with them)",
     )

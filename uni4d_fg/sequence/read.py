@@ -48,7 +48,7 @@ def detect_layout(root: Path, depth: str | None = None) -> LayoutName:
         return "native"
     raise SequenceProblem(
         root,
-        "is not a sequence folder: there is no rgb/ and no video",
+        "is not a sequence folder: there is no rgb/ and no video, nor are there images",
         "put frames into rgb/ and depth into depth_cue/ (native) or unidepth/depth.npy (Uni4D)",
     )
 
@@ -66,6 +66,8 @@ def find_files(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOpti
     """
     if layout not in ("auto", "native", "uni4d"):
         raise SequenceProblem(root, f"unknown layout {layout!r}", "choose auto, native or uni4d")
+    if not root.exists():
+        raise SequenceProblem(root, "no such folder or file", "check the path")
     if root.is_file():
         return _video_file(root, options)
     name = detect_layout(root, options.get("depth")) if layout == "auto" else layout

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.sequence.frames import SelectedFrames
 from uni4d_fg.sequence.model import GroundTruth, Video
@@ -80,7 +80,7 @@ def _take(video: Video, frames: IntArray) -> Video:
     truth = video.ground_truth
     tracks, points = video.tracks, truth.track_points
     if tracks is not None:
-        seen = tracks.visible[:, frames].any(axis=1)
+        seen: BoolArray = np.asarray(tracks.visible[:, frames].any(axis=1))
         tracks = _take_of_tracks(tracks.select(seen), frames)
         points = None if points is None else points[seen][:, frames]
     return replace(

@@ -13,6 +13,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.sequence import assemble, naming
 from uni4d_fg.sequence.calibration import VaryingIntrinsics, guess_intrinsics, implausible, load_intrinsics
+from uni4d_fg.sequence.decode import check_bit_depth
 from uni4d_fg.sequence.frames import FileFrames, ImageFolder, LazyFrames
 from uni4d_fg.sequence.layout import IMAGE_SUFFIXES, Layout, LayoutOptions, SequenceFiles, list_frames
 from uni4d_fg.sequence.poses import load_poses, load_timestamps
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 MOSTLY_MISSING = 0.5
 """Share of missing depth above which a warning is given."""
+MAX_TIME_RATIO = 1.5
+"""Ratio of the longest to the shortest time between frames that is taken for a constant frame rate."""
 PLAUSIBLE_DEPTH = (0.05, 200.0)
 """Range in metres in which a frame's median depth is expected."""
 
@@ -99,10 +102,38 @@ class _Validation:
         if isinstance(images, ImageFolder):
             self.image_stems = [file.stem for file in images.paths]
             naming.check_numbering(self.image_stems, self.findings)
-        scan_frames("images", images, self.findings)
+        else:
+            self._frame_times(images)
+
+        def visit(frame: int, image: npt.NDArray[np.uint8]) -> None:
+            if frame == 0 and isinstance(images, ImageFolder):
+                self.findings.attempt("images", lambda: check_bit_depth(images.paths[0]))
+
+        scan_frames("images", images, self.findings, visit)
         if self.findings.items[-1].shape:
             self.size = images.size
         self.findings.attempt("images", lambda: assemble.check_length(path, len(images)))
+
+    def _frame_times(self, images: VideoFrames) -> None:
+        """Say where the times of a video file are from, if not from a constant frame rate."""
+        if images.times is None:
+            source = "the frame rate" if images.frame_rate else "frame numbers"
+            self.findings.add(
+                "info",
+                "images",
+                f"{images.path}: its frames have no times that increase; {source} stand in for them",
+                "add timestamps.txt if times matter",
+            )
+            return
+        steps = np.diff(images.times)
+        if steps.size and steps.max() > MAX_TIME_RATIO * steps.min():
+            self.findings.add(
+                "info",
+                "images",
+                f"{images.path}: variable frame rate, frames {steps.min():.3g} to {steps.max():.3g} s apart; "
+                "their times are kept",
+                "none",
+            )
 
     def _depth(self, item: str, path: Path, units_per_metre: float) -> None:
         frames = self.findings.attempt(item, lambda: assemble.open_depth(path, self.size, units_per_metre))

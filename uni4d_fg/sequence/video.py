@@ -55,6 +55,7 @@ class VideoFrames(LazyFrames[ImageArray]):
         self.frame_rate = rate if np.isfinite(rate) and rate > 0 else None
         first = self._advance_to(0)
         if first is None:
+            self._check_complete(0)
             raise SequenceProblem(path, "holds no frame that can be decoded", _REMEDY)
         self.size: tuple[int, int] = (first.shape[0], first.shape[1])
         self._length, self.times = self._look_through(stop)
@@ -62,20 +63,22 @@ class VideoFrames(LazyFrames[ImageArray]):
     def _open(self) -> None:
         if not self.path.is_file():
             raise SequenceProblem(self.path, "no such video file", "check the path")
+        if self.path.stat().st_size == 0:
+            raise SequenceProblem(self.path, "is empty", "copy it again")
         self._capture.release()
         self._capture = _quiet_capture(self.path)
         self._next = 0
         if not self._capture.isOpened():
-            self._check_complete()
+            self._check_complete(0)
             raise SequenceProblem(self.path, "cannot be opened as a video", _REMEDY)
 
-    def _check_complete(self) -> None:
+    def _check_complete(self, readable: int) -> None:
+        """Raise InputError if the end of the file is missing; ``readable`` frames come before."""
         missing = missing_bytes(self.path)
         if missing:
+            use = f", or select frames before {readable - 1}" if readable > 2 else ""
             raise SequenceProblem(
-                self.path,
-                f"is cut short: {missing} bytes are missing at its end",
-                "copy it again, or use its beginning only, by selecting frames up to a stop",
+                self.path, f"is cut short: {missing} bytes are missing at its end", f"copy it again{use}"
             )
 
     def _look_through(self, stop: int | None) -> tuple[int, FloatArray | None]:
@@ -85,7 +88,7 @@ class VideoFrames(LazyFrames[ImageArray]):
         while (stop is None or len(times) < stop) and self._capture.grab():
             times.append(1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
         if stop is None or len(times) < stop:
-            self._check_complete()
+            self._check_complete(len(times))
         self._open()
         found = np.array(times)
         return len(found), found if np.isfinite(found).all() and (np.diff(found) > 0).all() else None
