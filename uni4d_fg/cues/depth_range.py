@@ -26,12 +26,14 @@ class DepthRange:
     farthest: Float32Array
     """Extremes within the window; equal to ``log_depth`` where there is none."""
     known: BoolArray
-    """Depth is known somewhere in the window."""
+    """Depth is known somewhere in the window ..."""
+    there: BoolArray
+    """... and at the pixel itself."""
 
     @property
     def spread(self) -> Float32Array:
-        """(H, W) range of log depth within the window."""
-        return np.where(self.known, self.farthest - self.nearest, np.float32(UNKNOWN_RANGE))
+        """(H, W) range of log depth within the window; where depth is missing, anything is possible."""
+        return np.where(self.there, self.farthest - self.nearest, np.float32(UNKNOWN_RANGE))
 
 
 def depth_range(depth: Float32Array, window_px: int) -> DepthRange:
@@ -55,6 +57,7 @@ def depth_range(depth: Float32Array, window_px: int) -> DepthRange:
         np.where(known, nearest, filled).astype(np.float32),
         np.where(known, farthest, filled).astype(np.float32),
         known,
+        there,
     )
 
 

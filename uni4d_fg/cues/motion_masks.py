@@ -120,8 +120,8 @@ def _warnings(motion: TrackMotion, area: float) -> list[str]:
     decided = int(motion.moving.sum() + motion.static.sum())
     if area > _MOST_MAY_MOVE or (decided and motion.moving.sum() > _MOST_MAY_MOVE * decided):
         return [
-            "motion masks: most of the image seems to move, so that what was taken for the static scene may be a moving "
-            "thing; give masks if the cameras look wrong"
+            "motion masks: most of the image seems to move, so that what was taken for the static scene may be a "
+            "moving thing; give masks if the cameras look wrong"
         ]
     return []
 
