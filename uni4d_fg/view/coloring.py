@@ -134,9 +134,10 @@ class Coloring:
                 + _scale("moving points: residual in this frame", values.trajectory_error, 1.0, "px")
                 + _scale("cameras: median residual", values.camera_error, 1.0, "px")
             )
+        factor, unit = self.run.small_unit
         return (
-            _scale("cameras: standard deviation of position", values.position_sigma, 1000.0, "mm")
-            + _scale("landmarks: standard deviation from their rays", values.landmark_sigma, 1000.0, "mm")
+            _scale("cameras: standard deviation of position", values.position_sigma, factor, unit)
+            + _scale("landmarks: standard deviation from their rays", values.landmark_sigma, factor, unit)
             + _swatch("moving points bridged, not seen", BRIDGED_AMBER)
         )
 

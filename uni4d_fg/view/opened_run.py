@@ -48,6 +48,22 @@ class OpenedRun:
         return str(name or self.folder.root.resolve().name)
 
     @property
+    def is_metric(self) -> bool:
+        """Whether lengths are metres, as far as is known; else they are of an unknown unit."""
+        cues = self.summary.get("cues")
+        return not isinstance(cues, dict) or cues.get("metric") is not False
+
+    @property
+    def unit(self) -> str:
+        """Unit of lengths."""
+        return "m" if self.is_metric else "units"
+
+    @property
+    def small_unit(self) -> tuple[float, str]:
+        """Factor and unit for small lengths: millimetres where lengths are metres."""
+        return (1000.0, "mm") if self.is_metric else (1.0, "units")
+
+    @property
     def num_frames(self) -> int:
         """Number of frames T."""
         return self.reconstruction.num_frames

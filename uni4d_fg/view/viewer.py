@@ -129,7 +129,8 @@ class Viewer:
         if np.isfinite(values.camera_error[frame]):
             parts.append(f"median residual {values.camera_error[frame]:.2f} px")
         if np.isfinite(values.position_sigma[frame]):
-            parts.append(f"position ± {1000.0 * values.position_sigma[frame]:.2g} mm")
+            factor, unit = self._run.small_unit
+            parts.append(f"position ± {factor * values.position_sigma[frame]:.2g} {unit}")
         return "  \n".join(parts)
 
     def _look_through(self, clients: list[Any]) -> None:
