@@ -56,6 +56,9 @@ class GeometricDepthConfig(Section):
     contact_smoothing: int = setting(
         9, "The depth at which a moving thing stands is the median over this many frames.", ge=1
     )
+    moving_depth_sigma: float = setting(
+        0.15, "Standard deviation of the log depth of moving things, known only from where they stand.", gt=0
+    )
 
 
 class AffineDepthConfig(Section):

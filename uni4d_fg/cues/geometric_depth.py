@@ -1,0 +1,309 @@
+"""Depth from camera motion alone: structure from motion, scaled by convention, interpolated to maps.
+
+Nothing in the images says how large the world is. The result is scaled so that the median depth of the static
+points in the first frame is ``geometric_depth.median_depth``; it is not metric. A camera that stays in one
+place shows no depth at all: it is given a sphere of that radius, with a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.interpolated_depth import (
+    InterpolatedDepths,
+    SparseInverseDepth,
+    ground_contact,
+    smooth_over_time,
+    supported,
+)
+from uni4d_fg.cues.structure.motion import Structure, rotations_only, structure_from_motion
+from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
+from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
+from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
+from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.sequence.model import FrameSource, Video
+from uni4d_fg.sequence.problems import some_of
+from uni4d_fg.stages.observations import Observations
+from uni4d_fg.tracks.model import Tracks
+
+NOT_METRIC = (
+    "depth is not metric: no depth cue was given, so it was found from camera motion, which does not see scale; "
+    "all lengths are in a unit of its own"
+)
+_FEW_FRAMES = 0.5
+_MIN_POINTS = 3
+_SPHERE_STEP = 16
+_PLAUSIBLE_FOCAL = (0.4, 3.0)
+"""Focal lengths, as parts of the longer image side, that cameras have: 103 to 19 degrees."""
+
+
+@dataclass(frozen=True)
+class GeometricDepth:
+    """Cameras and depth up to scale."""
+
+    depths: FrameSource[Float32Array]
+    """T maps (H, W), in the unit of the result; every pixel has a value."""
+    world_T_cam: FloatArray
+    """(T, 4, 4); the first camera is the world."""
+    intrinsics: FloatArray
+    """(4,) px."""
+    sparse: Float32Array
+    """(K, T) depth of every static observation that is triangulated well, NaN elsewhere."""
+    has_parallax: bool
+    """False if the camera stays in one place, so that depth is a convention."""
+    facts: tuple[str, ...]
+    """What was found, one line each."""
+    warnings: tuple[str, ...]
+    """What to distrust, one line each; the first says that depth is not metric."""
+
+
+def depth_from_motion(
+    video: Video,
+    tracks: Tracks,
+    is_static: BoolArray,
+    intrinsics: FloatArray,
+    config: Config,
+    reporter: Reporter | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> GeometricDepth:
+    """Find cameras and up-to-scale depth from tracks of the static scene.
+
+    Args:
+        video: Image size, and masks of what moves if there are any: their pixels get the depth at which the
+            thing stands on the static scene.
+        tracks: K tracks.
+        is_static: (K,) which tracks to use. Some may move all the same, as long as most do not.
+        intrinsics: (4,) px; kept when ``config.input.intrinsics`` is 'fixed', else a starting value.
+        config: Sections ``geometric_depth``, ``bundle_adjustment`` and ``input``.
+        reporter: Progress.
+        should_stop: Polled often.
+
+    Raises:
+        InputError: If tracks, video and ``is_static`` do not fit each other.
+        DegenerateProblemError: If there are no static tracks to speak of.
+        SolverError: If bundle adjustment fails.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    reporter, should_stop = reporter or SilentReporter(), should_stop or (lambda: False)
+    if tracks.num_frames != video.num_frames or is_static.shape != (tracks.num_tracks,):
+        raise InputError(
+            f"depth from motion: {tracks.num_tracks} tracks over {tracks.num_frames} frames and is_static "
+            f"{is_static.shape} do not fit {video.num_frames} frames; give one flag per track of this video"
+        )
+    observations = _static_observations(tracks, is_static)
+    if len(np.unique(observations.track)) < config.geometric_depth.min_pose_points:
+        raise DegenerateProblemError(
+            f"depth from motion: only {len(np.unique(observations.track))} tracks are static. Check the masks (is "
+            "everything marked as moving?) and the tracks, or give depth maps"
+        )
+    structure = structure_from_motion(
+        observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop
+    )
+    if structure is None:
+        return _without_parallax(video, tracks, is_static, observations, intrinsics, config.geometric_depth)
+    return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
+
+
+def settings_for_geometry(config: Config, depth: GeometricDepth) -> Config:
+    """Return the configuration for reconstructing with this depth.
+
+    Interpolated depth was made from the tracks, so it says nothing that they do not: bundle adjustment goes
+    without it, and starts from the cameras found with it. Depth of moving things is only where they stand.
+    Where there is no parallax, depth (a convention) is kept as it is, and so are the focal lengths.
+    """
+    if not depth.has_parallax:
+        return config.model_copy(update={"input": config.input.model_copy(update={"intrinsics": "fixed"})})
+    adjustment = config.bundle_adjustment.model_copy(update={"depth_prior": False, "structure": "keep"})
+    sigma = config.geometric_depth.moving_depth_sigma
+    return config.model_copy(
+        update={
+            "bundle_adjustment": adjustment,
+            "nonrigid": config.nonrigid.model_copy(update={"depth_sigma": sigma}),
+            "input": config.input.model_copy(update={"poses": "initial"}),
+        }
+    )
+
+
+def _static_observations(tracks: Tracks, is_static: BoolArray) -> Observations:
+    track, frame = np.nonzero(tracks.visible & is_static[:, None])
+    uv = tracks.uv[track, frame].astype(np.float64)
+    observations = Observations(
+        track.astype(np.int64), frame.astype(np.int64), uv, np.full(len(track), np.nan), np.ones(len(track))
+    )
+    return observations.with_min_observations(2)
+
+
+def _with_maps(
+    video: Video,
+    tracks: Tracks,
+    observations: Observations,
+    structure: Structure,
+    config: Config,
+    reporter: Reporter,
+    should_stop: Callable[[], bool],
+) -> GeometricDepth:
+    """Scale the structure and make depth maps of it."""
+    settings = config.geometric_depth
+    structure = _normalize(structure, observations, settings.median_depth)
+    inverse = _inverse_depths(structure, observations, settings)
+    sparse = np.full(tracks.visible.shape, np.nan, dtype=np.float32)
+    known = np.isfinite(inverse)
+    sparse[observations.track[known], observations.frame[known]] = 1.0 / inverse[known]
+    frames = _points_per_frame(observations, inverse, video.num_frames, settings)
+    depths = _stand(InterpolatedDepths(frames, video.image_size, settings), video, reporter, should_stop)
+    triangulated = int(np.isfinite(structure.points.position[:, 0]).sum())
+    fx, fy = structure.intrinsics[:2]
+    facts = (
+        f"structure from motion started from frames {structure.pair.first} and {structure.pair.second} "
+        f"(parallax {structure.pair.parallax_px:.0f} px); {int(structure.registered.sum())} of {video.num_frames} "
+        f"frames posed, {triangulated} of {len(structure.track)} static tracks triangulated, "
+        f"noise {structure.sigma_px:.2f} px, fx {fx:.1f} fy {fy:.1f} px",
+        f"scale by convention: median depth of the first frame is {settings.median_depth:g}",
+    )
+    warnings = (NOT_METRIC, *_doubts(video, structure))
+    return GeometricDepth(depths, structure.world_T_cam, structure.intrinsics, sparse, True, facts, warnings)
+
+
+def _doubts(video: Video, structure: Structure) -> list[str]:
+    warnings = []
+    bridged = np.flatnonzero(~structure.registered).tolist()
+    if bridged:
+        severe = len(bridged) > (1.0 - _FEW_FRAMES) * video.num_frames
+        warnings.append(
+            f"{len(bridged)} frame(s) see too few points of the static scene, and their cameras are only interpolated"
+            f"{' (most of the video: do not trust this result)' if severe else ''}: {some_of(bridged)}"
+        )
+    focal = float(np.mean(structure.intrinsics[:2]))
+    side = float(max(video.image_size))
+    if not _PLAUSIBLE_FOCAL[0] * side <= focal <= _PLAUSIBLE_FOCAL[1] * side:
+        warnings.append(
+            f"the focal length found ({focal:.0f} px, {focal / side:.2f} of the longer image side) is unusual: moving "
+            "things without a mask, or motion from which it cannot be told; give K.npy if it is known"
+        )
+    return warnings
+
+
+def _normalize(structure: Structure, observations: Observations, median_depth: float) -> Structure:
+    """Make the first camera the world and bring the median depth that it sees to ``median_depth``."""
+    first = structure.world_T_cam[0].copy()
+    position = world_to_camera(first, structure.points.position)
+    row = np.searchsorted(structure.track, observations.track[observations.frame == 0])
+    row = row[row < len(structure.track)]
+    seen = position[row[np.isin(structure.track[row], observations.track[observations.frame == 0])], 2]
+    seen = seen[seen > 0]
+    if len(seen) == 0:
+        seen = position[position[:, 2] > 0, 2]
+    factor = median_depth / float(np.median(seen))
+    poses = np.linalg.inv(first) @ structure.world_T_cam
+    poses[:, :3, 3] *= factor
+    rotation = first[:3, :3]
+    information = rotation.T @ structure.points.information @ rotation / factor**2
+    points = replace(structure.points, position=factor * position, information=information)
+    return replace(structure, world_T_cam=poses, points=points)
+
+
+def _inverse_depths(structure: Structure, observations: Observations, config: GeometricDepthConfig) -> FloatArray:
+    """Return the inverse depth of every observation's point in its frame, (N,); NaN where poorly known."""
+    out = np.full(len(observations), np.nan)
+    row = np.searchsorted(structure.track, observations.track)
+    has_row = np.isin(observations.track, structure.track)
+    for frame in range(len(structure.world_T_cam)):
+        mine = np.flatnonzero((observations.frame == frame) & has_row)
+        pose, rows = structure.world_T_cam[frame], row[mine]
+        position = structure.points.position[rows]
+        x = world_to_camera(pose, position)
+        good = np.isfinite(position).all(axis=1) & (x[:, 2] > NEAR_PLANE)
+        if structure.registered[frame]:  # elsewhere the pose is too rough to judge a pixel by
+            error = np.linalg.norm(project(structure.intrinsics, x) - observations.uv[mine], axis=1)
+            good &= error <= config.max_reprojection_px
+        mine, rows, z = mine[good], rows[good], x[good, 2]
+        if len(mine) == 0:
+            continue
+        information = structure.points.information[rows]
+        sigma = inverse_depth_sigma(pose, position[good], information, max(structure.sigma_px, 0.1))
+        inverse = 1.0 / z
+        typical = float(np.median(inverse))
+        fine = (sigma <= config.max_relative_sigma * typical) & supported(observations.uv[mine], inverse)
+        out[mine[fine]] = np.maximum(inverse[fine], typical / config.max_depth_ratio)
+    return out
+
+
+def _points_per_frame(
+    observations: Observations, inverse: FloatArray, num_frames: int, config: GeometricDepthConfig
+) -> tuple[SparseInverseDepth, ...]:
+    """Return the points to interpolate in every frame; one without any takes those of the nearest frame."""
+    known = np.isfinite(inverse)
+    found: list[SparseInverseDepth] = []
+    for frame in range(num_frames):
+        mine = known & (observations.frame == frame)
+        found.append(SparseInverseDepth(observations.uv[mine], inverse[mine]))
+    filled = np.array([len(points.inverse_depth) >= _MIN_POINTS for points in found])
+    if not filled.any():
+        everywhere = SparseInverseDepth(np.zeros((1, 2)), np.array([1.0 / config.median_depth]))
+        return (everywhere,) * num_frames
+    usable = np.flatnonzero(filled)
+    return tuple(found[int(usable[np.argmin(np.abs(usable - frame))])] for frame in range(num_frames))
+
+
+def _stand(
+    depths: InterpolatedDepths, video: Video, reporter: Reporter, should_stop: Callable[[], bool]
+) -> InterpolatedDepths:
+    """Stand what the masks mark on the static scene."""
+    if video.masks is None:
+        return depths
+    standing = []
+    reporter.begin("depth of moving things", video.num_frames)
+    for frame in range(video.num_frames):
+        if should_stop():
+            raise Cancelled("depth from motion stopped")
+        standing.append(ground_contact(video.masks[frame], depths.points[frame], depths.config))
+        reporter.advance(frame + 1)
+    reporter.end()
+    smoothed = smooth_over_time(standing, depths.config.contact_smoothing)
+    return replace(depths, masks=video.masks, standing=smoothed)
+
+
+def _without_parallax(
+    video: Video,
+    tracks: Tracks,
+    is_static: BoolArray,
+    observations: Observations,
+    intrinsics: FloatArray,
+    config: GeometricDepthConfig,
+) -> GeometricDepth:
+    """Return depth for a camera that stays in one place: a sphere around it, which a rotation does not change."""
+    height, width = video.image_size
+    nodes = np.stack(
+        np.meshgrid(
+            np.append(np.arange(0, width - 1, _SPHERE_STEP), width - 1),
+            np.append(np.arange(0, height - 1, _SPHERE_STEP), height - 1),
+        ),
+        axis=-1,
+    )
+    uv = nodes.reshape(-1, 2).astype(np.float64)
+    sphere = SparseInverseDepth(uv, 1.0 / _on_sphere(uv, intrinsics, config.median_depth))
+    depths = InterpolatedDepths((sphere,) * video.num_frames, video.image_size, config)
+    sparse = np.full(tracks.visible.shape, np.nan, dtype=np.float32)
+    seen = tracks.visible & is_static[:, None]
+    sparse[seen] = _on_sphere(tracks.uv[seen].astype(np.float64), intrinsics, config.median_depth)
+    poses = rotations_only(observations, video.num_frames, intrinsics)
+    warnings = (
+        NOT_METRIC,
+        "the camera does not move from its place (a turning camera explains the tracks to within "
+        f"{config.min_parallax_px:g} px), so depth cannot be seen: everything was put at distance "
+        f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
+    )
+    return GeometricDepth(depths, poses, intrinsics, sparse, False, ("no parallax",), warnings)
+
+
+def _on_sphere(uv: FloatArray, intrinsics: FloatArray, radius: float) -> FloatArray:
+    """Return the z-depth (N,) of a sphere around the camera at pixels (N, 2)."""
+    ray = (uv - intrinsics[2:]) / intrinsics[:2]
+    result: FloatArray = radius / np.sqrt(1.0 + np.sum(ray**2, axis=1))
+    return result

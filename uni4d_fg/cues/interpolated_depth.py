@@ -1,0 +1,149 @@
+"""Dense depth of one frame from sparse points, and of what moves from where it stands.
+
+Inverse depth is linear in the image over any plane, so it is what is interpolated: linearly over the Delaunay
+triangles of the static points in the frame, and taken from the nearest point outside their hull. A moving
+thing has no static points of its own. It is given one depth, that of the static surface at the lowest part
+of its mask, where it touches the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.spatial import Delaunay, QhullError, cKDTree
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.sequence.frames import LazyFrames
+from uni4d_fg.sequence.model import FrameSource
+
+_NEIGHBOURS = 8
+_SUPPORTERS = 2
+_LIKE = 1.25
+_MAX_CONTACT_COLUMNS = 200
+
+
+@dataclass(frozen=True)
+class SparseInverseDepth:
+    """Static points in one frame."""
+
+    uv: FloatArray
+    """(N, 2) px."""
+    inverse_depth: FloatArray
+    """(N,) positive."""
+
+
+@dataclass(frozen=True)
+class InterpolatedDepths(LazyFrames[Float32Array]):
+    """T depth maps, each interpolated when it is asked for."""
+
+    points: tuple[SparseInverseDepth, ...]
+    """T."""
+    image_size: tuple[int, int]
+    """(height, width), px."""
+    config: GeometricDepthConfig
+    masks: FrameSource[Int32Array] | None = None
+    standing: tuple[Mapping[int, float], ...] = field(default=())
+    """T: inverse depth of every moving thing in a frame, by mask id."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def where(self, frame: int) -> str:
+        """Return the frame number; there is no file."""
+        return f"interpolated depth [frame {frame}]"
+
+    def _read(self, frame: int) -> Float32Array:
+        inverse = interpolate(self.points[frame], self.image_size, self.config.stride)
+        if self.masks is not None:
+            mask = self.masks[frame]
+            for label, value in self.standing[frame].items():
+                inverse[mask == label] = value
+        return (1.0 / inverse).astype(np.float32)
+
+
+def interpolate(points: SparseInverseDepth, image_size: tuple[int, int], stride: int) -> Float32Array:
+    """Interpolate inverse depth over an image.
+
+    Args:
+        points: At least one point.
+        image_size: (height, width), px.
+        stride: Spacing of the grid on which it is computed; bilinear in between.
+
+    Returns:
+        (H, W), positive.
+    """
+    height, width = image_size
+    rows, columns = -(-height // stride), -(-width // stride)
+    # Centres as cv2.resize places them, so that its bilinear interpolation has no shift.
+    v = (np.arange(rows) + 0.5) * height / rows - 0.5
+    u = (np.arange(columns) + 0.5) * width / columns - 0.5
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    coarse = evaluate(points, grid).reshape(rows, columns).astype(np.float32)
+    return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def evaluate(points: SparseInverseDepth, uv: FloatArray) -> FloatArray:
+    """Return the interpolated inverse depth at pixels (M, 2), (M,)."""
+    out: FloatArray = np.asarray(NearestNDInterpolator(points.uv, points.inverse_depth)(uv), dtype=np.float64)
+    try:
+        triangles = Delaunay(points.uv)
+    except (QhullError, ValueError):  # fewer than three points, or all on one line
+        return out
+    inside = np.asarray(LinearNDInterpolator(triangles, points.inverse_depth)(uv))
+    result: FloatArray = np.where(np.isfinite(inside), inside, out)
+    return result
+
+
+def supported(uv: FloatArray, inverse_depth: FloatArray) -> BoolArray:
+    """Return which points (N,) have a few of their nearest neighbours in the image at a similar depth.
+
+    A wrong point stands alone; beside a depth edge there are neighbours on either side.
+    """
+    if len(uv) <= _NEIGHBOURS:
+        return np.ones(len(uv), dtype=bool)
+    _, index = cKDTree(uv).query(uv, k=_NEIGHBOURS + 1)
+    ratio = inverse_depth[index[:, 1:]] / inverse_depth[:, None]
+    result: BoolArray = np.count_nonzero((ratio < _LIKE) & (ratio > 1.0 / _LIKE), axis=1) >= _SUPPORTERS
+    return result
+
+
+def ground_contact(mask: Int32Array, points: SparseInverseDepth, config: GeometricDepthConfig) -> dict[int, float]:
+    """Return the inverse depth of the static surface just below every thing of a mask, by id.
+
+    Args:
+        mask: (H, W) 0 static, > 0 ids.
+        points: Static points of the frame.
+        config: ``contact_fraction``.
+    """
+    out: dict[int, float] = {}
+    for label in np.unique(mask[mask > 0]).tolist():
+        mine = mask == label
+        lines = np.flatnonzero(mine.any(axis=1))
+        height = int(np.ceil(config.contact_fraction * (lines[-1] - lines[0] + 1)))
+        lowest = mine[lines[-1] - height + 1 : lines[-1] + 1]
+        columns = np.flatnonzero(lowest.any(axis=0))
+        # The lowest pixel of each column in that part.
+        line = lines[-1] - np.argmax(lowest[::-1, columns], axis=0)
+        some = np.unique(np.linspace(0, len(columns) - 1, min(len(columns), _MAX_CONTACT_COLUMNS)).astype(np.int64))
+        uv = np.stack([columns[some], line[some]], axis=1).astype(np.float64)
+        out[int(label)] = float(np.median(evaluate(points, uv)))
+    return out
+
+
+def smooth_over_time(standing: list[dict[int, float]], window: int) -> tuple[dict[int, float], ...]:
+    """Replace each thing's value by its median over ``window`` frames: masks lose feet from frame to frame."""
+    half = window // 2
+    return tuple(
+        {
+            label: float(
+                np.median([other[label] for other in standing[max(0, t - half) : t + half + 1] if label in other])
+            )
+            for label in here
+        }
+        for t, here in enumerate(standing)
+    )

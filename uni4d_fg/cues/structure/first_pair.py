@@ -1,0 +1,79 @@
+"""The two frames to start from: many common tracks, and parallax that no rotation explains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.structure.two_view import parallax
+from uni4d_fg.stages.observations import Observations
+
+_SAMPLED_FRAMES = 20
+_ENOUGH_TRACKS = 300
+_FITTED_TRACKS = 400
+
+
+@dataclass(frozen=True)
+class FramePair:
+    """Two frames that share tracks."""
+
+    first: int
+    second: int
+    parallax_px: float
+    common: int
+    """Number of tracks that both see."""
+
+
+class CommonTracks:
+    """Looks up what two frames both see."""
+
+    def __init__(self, observations: Observations, num_frames: int) -> None:
+        tracks, row = observations.rows()
+        self.index = np.full((num_frames, len(tracks)), -1, dtype=np.int64)
+        self.index[observations.frame, row] = np.arange(len(observations))
+
+    def between(self, first: int, second: int) -> tuple[IntArray, IntArray]:
+        """Return the rows (N,) of the common tracks' observations in either frame."""
+        common = np.flatnonzero((self.index[first] >= 0) & (self.index[second] >= 0))
+        return self.index[first, common], self.index[second, common]
+
+
+def rank_pairs(
+    observations: Observations,
+    num_frames: int,
+    intrinsics: FloatArray,
+    config: GeometricDepthConfig,
+    *,
+    known_focal: bool,
+) -> list[FramePair]:
+    """Rank pairs of (at most 20, evenly spaced) frames, best first.
+
+    A pair is worth its parallax up to ``start_parallax_px``, times the root of its common tracks: with that
+    many, more tracks say more than a longer baseline.
+
+    Args:
+        observations: Observations of static tracks.
+        num_frames: T.
+        intrinsics: (4,) px.
+        config: Thresholds.
+        known_focal: Whether the focal lengths are exact.
+    """
+    sampled = np.unique(np.linspace(0, num_frames - 1, min(num_frames, _SAMPLED_FRAMES)).astype(np.int64)).tolist()
+    common_tracks = CommonTracks(observations, num_frames)
+    pairs = []
+    for position, first in enumerate(sampled):
+        for second in sampled[position + 1 :]:
+            a, b = common_tracks.between(first, second)
+            if len(a) < config.min_common_tracks:
+                break  # tracks only get fewer
+            used = np.unique(np.linspace(0, len(a) - 1, min(len(a), _FITTED_TRACKS)).astype(np.int64))
+            moved = parallax(observations.uv[a[used]], observations.uv[b[used]], intrinsics, known_focal=known_focal)
+            pairs.append(FramePair(first, second, moved, len(a)))
+    return sorted(pairs, key=lambda pair: -_worth(pair, config))
+
+
+def _worth(pair: FramePair, config: GeometricDepthConfig) -> float:
+    return min(pair.parallax_px, config.start_parallax_px) * float(np.sqrt(min(pair.common, _ENOUGH_TRACKS)))

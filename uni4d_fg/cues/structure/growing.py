@@ -1,0 +1,265 @@
+"""A static scene that grows frame by frame: poses by resection, points by triangulation, bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
+from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
+from uni4d_fg.cues.structure.triangulation import Points, RayBundle, ray_angles, triangulate
+from uni4d_fg.cues.structure.two_view import relative_pose
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
+from uni4d_fg.graph.state import State, VariableNames
+from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.summary import Termination
+from uni4d_fg.stages.bundle_adjustment import Freedom, StaticNoise, bundle_adjustment_stage
+from uni4d_fg.stages.observations import Observations
+from uni4d_fg.stages.stage import run_stage
+
+_RESECTION_TRIALS = 500
+_FOCAL_NEEDS_FRAMES = 3
+"""Two views alone do not determine a focal length robustly."""
+
+
+@dataclass
+class GrowingScene:
+    """Cameras and points found so far. M tracks, N observations of them, T frames."""
+
+    observations: Observations
+    row: IntArray
+    """(N,) track row of each observation."""
+    num_tracks: int
+    intrinsics: FloatArray
+    world_T_cam: FloatArray
+    """(T, 4, 4)."""
+    registered: BoolArray
+    """(T,) frames whose pose is known."""
+    position: FloatArray
+    """(M, 3) NaN where not triangulated."""
+    good: BoolArray
+    """(N,) observations that agree with their point, of those that have one."""
+    config: Config
+    free_focal: bool
+    prior_intrinsics: FloatArray
+    should_stop: Callable[[], bool]
+
+    @classmethod
+    def empty(
+        cls,
+        observations: Observations,
+        num_frames: int,
+        intrinsics: FloatArray,
+        config: Config,
+        *,
+        free_focal: bool,
+        prior_intrinsics: FloatArray,
+        should_stop: Callable[[], bool],
+    ) -> GrowingScene:
+        """Return a scene without cameras and points."""
+        tracks, row = observations.rows()
+        return cls(
+            observations, row, len(tracks), intrinsics.copy(), np.tile(np.eye(4), (num_frames, 1, 1)),
+            np.zeros(num_frames, dtype=bool), np.full((len(tracks), 3), np.nan),
+            np.zeros(len(observations), dtype=bool), config, free_focal, prior_intrinsics, should_stop,
+        )  # fmt: skip
+
+    def start(self, pair: FramePair) -> int:
+        """Take two frames as the first cameras; return the number of points that they see with enough angle."""
+        settings = self.config.geometric_depth
+        a, b = CommonTracks(self.observations, len(self.world_T_cam)).between(pair.first, pair.second)
+        uv = self.observations.uv
+        found = relative_pose(uv[a], uv[b], self.intrinsics, 0.5 * settings.max_reprojection_px)
+        if found is None:
+            return 0
+        self.world_T_cam[pair.second] = found.first_T_second
+        self.registered[[pair.first, pair.second]] = True
+        new = np.zeros(self.num_tracks, dtype=bool)
+        new[self.row[a[found.inlier]]] = True
+        self.triangulate(new)
+        self._normalize(pair.first)
+        return int(np.isfinite(self.position[:, 0]).sum())
+
+    def next_frame(self, excluded: set[int]) -> int | None:
+        """Return the frame without a pose that sees most points; None if none sees enough."""
+        seen = np.isfinite(self.position[self.row, 0])
+        counts = np.bincount(self.observations.frame[seen], minlength=len(self.registered))
+        counts[self.registered] = 0
+        counts[list(excluded)] = 0
+        best = int(np.argmax(counts))
+        return best if counts[best] >= self.config.geometric_depth.min_pose_points else None
+
+    def register(self, frame: int) -> bool:
+        """Find a frame's pose from the points it sees (resection with RANSAC), then new points; False if it fails."""
+        settings = self.config.geometric_depth
+        mine = np.flatnonzero((self.observations.frame == frame) & np.isfinite(self.position[self.row, 0]))
+        known = np.flatnonzero(self.registered)
+        nearest = int(known[np.argmin(np.abs(known - frame))])
+        pose = _resect(
+            self.position[self.row[mine]], self.observations.uv[mine], self.intrinsics,
+            self.world_T_cam[nearest], settings.max_reprojection_px, settings.min_pose_points,
+        )  # fmt: skip
+        if pose is None:
+            return False
+        self.world_T_cam[frame], self.registered[frame] = pose, True
+        missing = ~np.isfinite(self.position[:, 0])
+        visible = np.zeros(self.num_tracks, dtype=bool)
+        visible[self.row[self.observations.frame == frame]] = True
+        self.triangulate(missing & visible)
+        self._judge()
+        return True
+
+    def triangulate(self, which: BoolArray) -> None:
+        """Triangulate tracks (M,) from the frames that have a pose; what does not fit stays without a point."""
+        settings = self.config.geometric_depth
+        used = np.flatnonzero(which[self.row] & self.registered[self.observations.frame])
+        rows, local = np.unique(self.row[used], return_inverse=True)
+        points = triangulate(self._rays(used, local, len(rows)))
+        fits = sound(points, settings.max_reprojection_px, settings.min_angle_deg)
+        self.position[rows] = np.where(fits[:, None], points.position, np.nan)
+        self._judge()
+
+    def adjust(self, hooks: Hooks | None = None) -> None:
+        """Refine all cameras, points and (from three frames on) the focal lengths; then judge all observations.
+
+        Raises:
+            Cancelled: If asked to stop.
+            SolverError: If the system cannot be solved.
+        """
+        self._judge()
+        frames = np.flatnonzero(self.registered)
+        keep = self.good & self.registered[self.observations.frame]
+        keep &= np.bincount(self.row[keep], minlength=self.num_tracks)[self.row] >= 2
+        used = self.observations.select(keep)
+        position_of = np.full(len(self.registered), -1, dtype=np.int64)
+        position_of[frames] = np.arange(len(frames))
+        used = Observations(used.track, position_of[used.frame], used.uv, used.depth, used.weight)
+        rows = np.unique(self.row[keep])
+        tracks, _ = used.rows()
+        state = State(
+            {
+                "pose": self.world_T_cam[frames],
+                "intrinsics": self.intrinsics[None],
+                "landmark": self.position[rows],
+            },
+            VariableNames(landmark_track=tracks),
+        )
+        settings = geometric_bundle_adjustment(self.config.bundle_adjustment)
+        stage = bundle_adjustment_stage(
+            state,
+            used,
+            StaticNoise(settings.reprojection_sigma_px, settings.depth_sigma),
+            settings,
+            self.prior_intrinsics[None],
+            Freedom(poses=True, intrinsics=self.free_focal and len(frames) >= _FOCAL_NEEDS_FRAMES),
+            unsquared=False,
+            normalization="mean",
+        )
+        state, summary = run_stage(stage, state, hooks or Hooks(should_stop=self.should_stop))
+        if summary.termination is Termination.CANCELLED:
+            raise Cancelled("structure from motion stopped")
+        self.world_T_cam[frames] = se3.orthonormalize(state["pose"])
+        self.intrinsics = state["intrinsics"][0].copy()
+        self.position[rows] = state["landmark"]
+        self._forget_flat()
+        self._judge()
+
+    def cost(self, frames: BoolArray) -> float:
+        """Return the mean truncated squared error, in [0, 1], over all observations in the given frames (T,).
+
+        What has no point, or no pose, counts as fully wrong: so scenes with other points can be compared.
+        """
+        limit = self.config.geometric_depth.max_reprojection_px
+        error = np.where(self.registered[self.observations.frame], self.errors(), np.inf)[
+            frames[self.observations.frame]
+        ]
+        with np.errstate(invalid="ignore"):
+            ratio = np.where(np.isfinite(error), np.minimum(error / limit, 1.0), 1.0)
+        return float(np.mean(ratio**2))
+
+    def errors(self) -> FloatArray:
+        """Return the reprojection error of every observation, (N,) px; infinite without a point or behind."""
+        x = world_to_camera(self.world_T_cam[self.observations.frame], self.position[self.row])
+        with np.errstate(invalid="ignore"):
+            error = np.linalg.norm(self.observations.uv - project(self.intrinsics, x), axis=1)
+            usable = np.isfinite(error) & (x[:, 2] > NEAR_PLANE)
+        result: FloatArray = np.where(usable, error, np.inf)
+        return result
+
+    def _judge(self) -> None:
+        self.good = self.registered[self.observations.frame] & (
+            self.errors() <= self.config.geometric_depth.max_reprojection_px
+        )
+        # A point that fewer than two observations hold is none.
+        held = np.bincount(self.row[self.good], minlength=self.num_tracks) >= 2
+        self.position[~held] = np.nan
+
+    def _forget_flat(self) -> None:
+        """Forget points that bundle adjustment has moved to where their rays are parallel."""
+        used = np.flatnonzero(self.good & np.isfinite(self.position[self.row, 0]))
+        rows, local = np.unique(self.row[used], return_inverse=True)
+        angle = ray_angles(self._rays(used, local, len(rows)), self.position[rows])
+        self.position[rows[angle < np.radians(0.5 * self.config.geometric_depth.min_angle_deg)]] = np.nan
+
+    def _rays(self, used: IntArray, local: IntArray, count: int) -> RayBundle:
+        return RayBundle(
+            local.astype(np.int64),
+            self.world_T_cam[self.observations.frame[used]],
+            self.observations.uv[used],
+            self.intrinsics,
+            count,
+        )
+
+    def _normalize(self, frame: int) -> None:
+        """Bring the median depth in a frame to ``median_depth`` (the world is that camera)."""
+        z = self.position[np.isfinite(self.position[:, 0]), 2]
+        if len(z) == 0:
+            return
+        factor = self.config.geometric_depth.median_depth / max(float(np.median(z)), 1e-9)
+        self.position *= factor
+        self.world_T_cam[:, :3, 3] *= factor
+
+
+def sound(points: Points, max_error_px: float, min_angle_deg: float) -> BoolArray:
+    """Return which triangulated points (M,) fit their tracks and have rays that meet at enough of an angle."""
+    with np.errstate(invalid="ignore"):
+        fits = (points.error_px <= max_error_px) & (points.angle >= np.radians(min_angle_deg))
+    result: BoolArray = fits & np.isfinite(points.position).all(axis=1)
+    return result
+
+
+def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:
+    """Return stage 2 without depth, and without E_cam: frames that have a pose need not follow each other."""
+    still = CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0)
+    return config.model_copy(update={"depth_prior": False, "camera_motion": still})
+
+
+def _resect(
+    points: FloatArray, uv: FloatArray, intrinsics: FloatArray, guess: FloatArray, threshold_px: float, min_points: int
+) -> FloatArray | None:
+    """Return the pose (4, 4) of a camera that sees N world points (N, 3) at uv (N, 2), or None."""
+    if len(points) < min_points:
+        return None
+    fx, fy, cx, cy = intrinsics
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    start = se3.inverse(guess)
+    rotation, translation = cv2.Rodrigues(start[:3, :3])[0], start[:3, 3:].copy()
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        points, uv, matrix, None, rvec=rotation, tvec=translation, useExtrinsicGuess=False,
+        iterationsCount=_RESECTION_TRIALS, reprojectionError=threshold_px, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    if not found or inliers is None or len(inliers) < min_points:
+        return None
+    index = inliers[:, 0]
+    rotation, translation = cv2.solvePnPRefineLM(points[index], uv[index], matrix, None, rotation, translation)
+    cam_T_world = np.eye(4)
+    cam_T_world[:3, :3], cam_T_world[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    pose: FloatArray = se3.inverse(se3.orthonormalize(cam_T_world))
+    return pose if np.isfinite(pose).all() else None

@@ -1,0 +1,127 @@
+r"""Two views: how much of their motion a rotation leaves unexplained, and the pose between them.
+
+A camera that only turns moves every pixel by ``K R K^-1``, whatever the depth. The parallax of two frames is
+
+    min over R and focal length f of  median_k | z'_k - pi_K(R pi_K^-1(z_k)) |      [px]
+
+and depth can be seen only where it is well above the noise of the tracks. The focal length is part of the
+minimum, because with a wrong one a pure rotation looks like parallax.
+
+Sources: rotation by Kabsch (1976); essential matrix by Nister's five points with MAGSAC (OpenCV).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import project, unproject
+
+_FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
+_REWEIGHTINGS = 5
+_CONFIDENCE = 0.9999
+_MAX_TRIALS = 5000
+
+
+@dataclass(frozen=True)
+class RotationFit:
+    """The rotation that explains most of the motion between two frames."""
+
+    second_R_first: FloatArray
+    """(3, 3)."""
+    residual_px: float
+    """Median distance that is left."""
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """The second camera seen from the first, with a baseline of length 1."""
+
+    first_T_second: FloatArray
+    """(4, 4) pose of the second camera in the first one's frame."""
+    inlier: BoolArray
+    """(N,) tracks that agree and lie in front of both cameras."""
+
+
+def fit_rotation(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray) -> RotationFit:
+    """Fit a rotation to N pixel pairs (N, 2), robustly (reweighted towards the median distance).
+
+    Args:
+        uv_first: (N, 2) px.
+        uv_second: (N, 2) px.
+        intrinsics: (4,) px.
+    """
+    a, b = _rays(uv_first, intrinsics), _rays(uv_second, intrinsics)
+    weight = np.ones(len(a))
+    distance = np.full(len(a), np.inf)
+    rotation = np.eye(3)
+    for _ in range(_REWEIGHTINGS):
+        u, _, vt = np.linalg.svd((b * weight[:, None]).T @ a)
+        rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        moved = a @ rotation.T
+        distance = np.linalg.norm(project(intrinsics, moved) - uv_second, axis=1)
+        scale = max(float(np.median(distance)), 1e-3)
+        weight = 1.0 / np.maximum(distance / scale, 1.0)
+    return RotationFit(rotation, float(np.median(distance)))
+
+
+def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, *, known_focal: bool) -> float:
+    """Return the median motion (px) of N pixel pairs that no rotation explains.
+
+    Args:
+        uv_first: (N, 2) px.
+        uv_second: (N, 2) px.
+        intrinsics: (4,) px; the focal lengths are varied from half to twice unless ``known_focal``.
+        known_focal: Whether the focal lengths are exact.
+    """
+    factors = np.ones(1) if known_focal else _FOCAL_FACTORS
+    scaled = [intrinsics * np.array([factor, factor, 1.0, 1.0]) for factor in factors]
+    return min(fit_rotation(uv_first, uv_second, k).residual_px for k in scaled)
+
+
+def relative_pose(
+    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, threshold_px: float
+) -> RelativePose | None:
+    """Find the pose between two views by a robust essential matrix; None if there is none.
+
+    Args:
+        uv_first: (N, 2) px.
+        uv_second: (N, 2) px.
+        intrinsics: (4,) px.
+        threshold_px: Distance to the epipolar line up to which a pair agrees.
+
+    Returns:
+        The pose; the same input gives the same result (OpenCV's MAGSAC draws from a fixed seed).
+    """
+    if len(uv_first) < 8:
+        return None
+    rays = [unproject(intrinsics, uv, np.ones(len(uv)))[:, :2] for uv in (uv_first, uv_second)]
+    essential, mask = cv2.findEssentialMat(
+        rays[0],
+        rays[1],
+        np.eye(3),
+        method=cv2.USAC_MAGSAC,
+        prob=_CONFIDENCE,
+        threshold=threshold_px / float(np.mean(intrinsics[:2])),
+        maxIters=_MAX_TRIALS,
+    )
+    if essential is None or essential.shape != (3, 3):
+        return None
+    # The mask is changed in place: what lies behind a camera, or too far away to tell, goes out.
+    count, rotation, translation, mask = cv2.recoverPose(essential, rays[0], rays[1], np.eye(3), mask=mask.copy())
+    if count < 8:
+        return None
+    second_T_first = np.eye(4)
+    second_T_first[:3, :3], second_T_first[:3, 3] = rotation, translation[:, 0]
+    pose = se3.inverse(se3.orthonormalize(second_T_first))
+    return RelativePose(pose, np.asarray(mask[:, 0] > 0))
+
+
+def _rays(uv: FloatArray, intrinsics: FloatArray) -> FloatArray:
+    rays: FloatArray = unproject(intrinsics, uv, np.ones(len(uv)))
+    unit: FloatArray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
