@@ -192,7 +192,7 @@ def test_a_sequence_with_an_empty_set_of_tracks(tmp_path: Path, scene: Sequence)
     none = Tracks(np.zeros((0, FRAMES, 2), np.float32), np.zeros((0, FRAMES), bool), np.zeros(0, np.int32))
     assert_refused(dataclasses.replace(scene, tracks=none), tmp_path / "estimate", "0 static", "tracks")
     known = dataclasses.replace(with_true_poses(scene), tracks=none)
-    _, result = run_sound(known, tmp_path / "fixed", make_config(*FIXED))
+    _, result = run_sound(known, tmp_path / "fixed", make_config(*FIXED, "fusion.averaged_offsets=[]"))
     assert len(result.landmarks) == len(result.dynamic_points) == 0
     np.testing.assert_array_equal(read_depth(RunFolder(tmp_path / "fixed").depth).array, depth_of(scene))
 

@@ -104,8 +104,8 @@ class BundleAdjustmentConfig(Section):
     )
     covariance_cells: int = setting(
         8,
-        "Static tracks that start in the same cell, of this many along the longer image side, are taken to err alike in "
-        "the covariances of the cameras, in whatever way they do; 0 takes all observations for independent.",
+        "Static tracks that start in the same cell, of this many along the longer image side, may err alike, in whatever "
+        "way: the covariances of the cameras allow for it; 0 takes all observations for independent.",
         ge=0,
         le=64,
     )
@@ -206,8 +206,8 @@ class FusionConfig(Section):
         (1, 2, 4, 6, 8),
         "Static depth is averaged with that of the frames this far before and after; empty leaves it out.",
     )
-    max_disagreement: float = setting(
-        0.05, "... where its logarithm differs from theirs, seen from there, by less than this.", gt=0
+    averaged_sigmas: float = setting(
+        2.5, "... where their logarithms differ by less than this many measured depth sigmas.", gt=0
     )
     edge_relative_gradient: float = setting(
         0.05, "Pixels whose depth changes by more than this part per pixel are left out of the clouds.", gt=0
