@@ -32,10 +32,6 @@ from uni4d_fg.sequence.problems import some_of
 from uni4d_fg.stages.observations import Observations
 from uni4d_fg.tracks.model import Tracks
 
-NOT_METRIC = (
-    "depth is not metric: no depth cue was given, so it was found from camera motion, which does not see scale; "
-    "all lengths are in a unit of its own"
-)
 _FEW_FRAMES = 0.5
 _MIN_POINTS = 3
 _SPHERE_STEP = 16
@@ -60,7 +56,7 @@ class GeometricDepth:
     facts: tuple[str, ...]
     """What was found, one line each."""
     warnings: tuple[str, ...]
-    """What to distrust, one line each; the first says that depth is not metric."""
+    """What to distrust besides the scale, which is never metric; one line each."""
 
 
 def depth_from_motion(
@@ -166,7 +162,7 @@ def _with_maps(
         f"noise {structure.sigma_px:.2f} px, fx {fx:.1f} fy {fy:.1f} px",
         f"scale by convention: median depth of the first frame is {settings.median_depth:g}",
     )
-    warnings = (NOT_METRIC, *_doubts(video, structure))
+    warnings = tuple(_doubts(video, structure))
     return GeometricDepth(depths, structure.world_T_cam, structure.intrinsics, sparse, True, facts, warnings)
 
 
@@ -294,7 +290,6 @@ def _without_parallax(
     sparse[seen] = _on_sphere(tracks.uv[seen].astype(np.float64), intrinsics, config.median_depth)
     poses = rotations_only(observations, video.num_frames, intrinsics)
     warnings = (
-        NOT_METRIC,
         "the camera does not move from its place (a turning camera explains the tracks to within "
         f"{config.min_parallax_px:g} px), so depth cannot be seen: everything was put at distance "
         f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
