@@ -70,7 +70,7 @@ def _plan(
     for value in nice_ticks(centre[0] - half, centre[0] + half, count=4):
         x = at(np.array([value, centre[1]]))[0]
         parts.append(element("line", x1=f"{x:.1f}", x2=f"{x:.1f}", y1=_MARGIN, y2=_MARGIN + side, class_="grid"))
-        place = {"x": f"{x:.1f}", "y": _MARGIN + side + 16}
+        place: dict[str, str | int] = {"x": f"{x:.1f}", "y": _MARGIN + side + 16}
         parts.append(element("text", _tick(value), **place, text_anchor="middle", class_="tick"))
     for value in nice_ticks(centre[1] - half, centre[1] + half, count=4):
         y = at(np.array([centre[0], value]))[1]
@@ -83,7 +83,7 @@ def _plan(
     )  # fmt: skip
     if truth is not None:
         line = "M" + "L".join("{:.1f} {:.1f}".format(*at(point)) for point in truth)
-        dashes = {"stroke": "currentColor", "stroke_dasharray": "5 3", "stroke_width": 1.2}
+        dashes: dict[str, str | float] = {"stroke": "currentColor", "stroke_dasharray": "5 3", "stroke_width": 1.2}
         parts.append(element("path", d=line, fill="none", **dashes))
     kept = np.unique(np.linspace(0, len(path) - 1, min(len(path), _MAX_SEGMENTS)).astype(int))
     colors = matplotlib.colormaps["viridis"](kept / max(len(path) - 1, 1))[:, :3]

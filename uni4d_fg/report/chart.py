@@ -64,7 +64,7 @@ def line_chart(
         parts.append(element("line", x1=_LEFT, x2=_WIDTH - _RIGHT, y1=f"{y:.1f}", y2=f"{y:.1f}", class_="grid"))
         parts.append(element("text", number(value), x=_LEFT - 6, y=f"{y + 4:.1f}", text_anchor="end", class_="tick"))
     for value in nice_ticks(x_low, x_high, whole=True):
-        place = {"x": f"{at_x(value):.1f}", "y": _HEIGHT - _BOTTOM + 16}
+        place: dict[str, str | int] = {"x": f"{at_x(value):.1f}", "y": _HEIGHT - _BOTTOM + 16}
         parts.append(element("text", f"{value:.4g}", **place, text_anchor="middle", class_="tick"))
     parts.append(element("text", x_label, x=(_LEFT + _WIDTH - _RIGHT) / 2, y=_HEIGHT - 6, text_anchor="middle"))
     parts.append(
@@ -77,9 +77,9 @@ def line_chart(
             transform=f"rotate(-90 12 {(_TOP + _HEIGHT - _BOTTOM) / 2})",
         )
     )
-    for index, (x, y) in enumerate(curves):
-        levels = np.log10(y) if log else y
-        path = _path([(at_x(a), at_y(b)) for a, b in zip(x.tolist(), levels.tolist(), strict=True)])
+    for index, (across, up) in enumerate(curves):
+        levels = np.log10(up) if log else up
+        path = _path([(at_x(a), at_y(b)) for a, b in zip(across.tolist(), levels.tolist(), strict=True)])
         parts.append(element("path", d=path, class_="line", **_look(index)))
     described = f"{title}. " + " ".join(_describe(line.name, y) for line, (_, y) in zip(lines, curves, strict=True))
     chart = svg(identifier, title, described, _WIDTH, _HEIGHT, parts)

@@ -27,7 +27,7 @@ def _facts(run: OpenedRun) -> Markup:
     reconstruction, summary = run.reconstruction, run.summary
     height, width = reconstruction.image_size
     times = reconstruction.timestamps
-    seconds = [stage.get("seconds", 0.0) for stage in summary.get("stages", {}).values()]
+    seconds = [_seconds(stage) for stage in summary.get("stages", {}).values()]
     memory = [stage.get("peak_memory_mb", 0.0) for stage in summary.get("stages", {}).values()]
     solver = summary.get("solver", {})
     fx, fy, cx, cy = reconstruction.intrinsics.tolist()
@@ -67,13 +67,24 @@ def _stages(stages: dict[str, Any]) -> Markup:
     rows = []
     for name, stage in stages.items():
         title = name.replace("_", " ") + (" (taken over)" if stage.get("resumed") else "")
-        rows.append([title, f"{stage.get('seconds', 0.0):.1f}", number(stage.get("peak_memory_mb"), 4)])
-    facts = [f"{name.replace('_', ' ')}: {fact}" for name, stage in stages.items() for fact in stage.get("facts", [])]
+        rows.append([title, f"{_seconds(stage):.1f}", number(stage.get("peak_memory_mb"), 4)])
+    facts = [f"{name.replace('_', ' ')}: {fact}" for name, stage in stages.items() for fact in _stage_facts(stage)]
     return join([
         element("h3", "Stages"),
         table("Time and memory of the stages", ("stage", "seconds", "peak memory so far, MB"), rows),
         bullets(facts),
     ])  # fmt: skip
+
+
+def _seconds(stage: dict[str, Any]) -> float:
+    """Return the time a stage took; ``stream`` records it per phase."""
+    seconds = stage.get("seconds", 0.0)
+    return float(seconds.get("total", 0.0) if isinstance(seconds, dict) else seconds)
+
+
+def _stage_facts(stage: dict[str, Any]) -> list[str]:
+    counts = [f"{count} frames {name}" for name, count in stage.get("counts", {}).items()]
+    return [*map(str, stage.get("facts", [])), *([", ".join(counts)] if counts else [])]
 
 
 def _config(run: OpenedRun) -> Markup:
