@@ -35,7 +35,7 @@ class DenseFlow:
     """Flow between grey images of one size; one object serves a whole video."""
 
     def __init__(self) -> None:
-        self._solver = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def between(self, source: ImageArray, target: ImageArray) -> Float32Array:
         """Return (H, W, 2) px: pixel u of ``source`` is at ``u + flow`` in ``target``. Both are (H, W) uint8."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from uni4d_fg.arrays import Float32Array
 
@@ -21,8 +22,8 @@ def guided_filter(guide: Float32Array, values: Float32Array, radius_px: int, con
     """
     window = (2 * radius_px + 1, 2 * radius_px + 1)
 
-    def mean(array: Float32Array) -> Float32Array:
-        return np.asarray(cv2.boxFilter(array, -1, window))
+    def mean(array: npt.NDArray[np.floating]) -> Float32Array:
+        return np.asarray(cv2.boxFilter(array, -1, window), np.float32)
 
     mean_guide, mean_values = mean(guide), mean(values)
     covariance = mean(guide * values[..., None]) - mean_guide * mean_values[..., None]

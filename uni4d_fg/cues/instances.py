@@ -169,7 +169,7 @@ def _assign(
         instances[row].mask, instances[row].missed = small[column], 0
     taken = {row for row, _ in pairs}
     if config.join_parts:
-        for column in np.flatnonzero(number_of == 0):
+        for column in np.flatnonzero(number_of == 0).tolist():
             rows_around = [row for row in taken if within[row, column] >= _PART]
             if rows_around:
                 best = max(rows_around, key=lambda row: float(within[row, column]))
@@ -177,7 +177,7 @@ def _assign(
                 instances[best].mask = np.maximum(instances[best].mask, small[column])
     for row, instance in enumerate(instances):
         instance.missed += 0 if row in taken else 1
-    for column in np.flatnonzero(number_of == 0):
+    for column in np.flatnonzero(number_of == 0).tolist():
         number_of[column] = next_number
         instances.append(_Instance(next_number, int(found.class_ids[column]), small[column], np.zeros(2)))
         next_number += 1

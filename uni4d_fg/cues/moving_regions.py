@@ -60,7 +60,7 @@ def moving_region(
     """
     height, width = full_size
     radius = max(1, round(config.smoothing_px * evidence.shape[1] / width))
-    smooth = guided_filter(image.astype(np.float32) / 255, evidence, radius, config.smoothing_contrast)
+    smooth = guided_filter(np.float32(1 / 255) * image.astype(np.float32), evidence, radius, config.smoothing_contrast)
     full = np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR))
     region: BoolArray = full > config.threshold
     return _fill_holes(region, round(config.min_area_fraction * height * width))

@@ -185,7 +185,7 @@ def _fit_shared(
     chosen = residual[thin]
     inverse = 1.0 / np.sqrt(np.maximum(variance[0], variance[2])[thin])
     weight = inverse**2
-    coefficients = np.zeros((6, 2))
+    coefficients: FloatArray = np.zeros((6, 2))
     for _ in range(8):
         normal = (terms * weight[:, None]).T @ terms
         normal += _SHARED_PRIOR * weight.sum() * np.eye(6)
