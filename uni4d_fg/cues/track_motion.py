@@ -189,7 +189,7 @@ def _fit_shared(
     for _ in range(8):
         normal = (terms * weight[:, None]).T @ terms
         normal += _SHARED_PRIOR * weight.sum() * np.eye(6)
-        coefficients = np.linalg.solve(normal, (terms * weight[:, None]).T @ chosen)
+        coefficients = np.asarray(np.linalg.solve(normal, (terms * weight[:, None]).T @ chosen), np.float64)
         miss = np.linalg.norm(chosen - terms @ coefficients, axis=1) * inverse
         scale = max(1.5 * 1.4826 * float(np.median(miss)), 1e-6)
         weight = inverse**2 / (1.0 + (miss / scale) ** 2) ** 2
