@@ -105,12 +105,12 @@ def test_a_missed_thing_is_drawn_where_it_would_be() -> None:
 
 
 def test_a_fast_pan_is_followed_by_flow_and_not_by_overlap_alone() -> None:
-    # Things of 20 px, 24 px apart, move by 16 px per frame: each overlaps most with the place of its neighbour.
-    scene = Scene({n: [(30, 100 + 24 * (n - 1) - 16 * t) for t in range(5)] for n in (1, 2)}, side=20)
+    # Things of 12 px, 15 px apart, move by 10 px per frame: each overlaps most with the place of its neighbour.
+    scene = Scene({n: [(30, 100 + 15 * (n - 1) - 10 * t) for t in range(5)] for n in (1, 2)}, side=12)
     canvas = texture(0, (SIZE[0], SIZE[1] + 64))
     for n in (1, 2):
-        canvas[30:50, 100 + 24 * (n - 1) : 120 + 24 * (n - 1)] = texture(n, (20, 20))
-    scene.images = np.stack([canvas[:, 16 * t : 16 * t + SIZE[1]] for t in range(5)])
+        canvas[30:42, 100 + 15 * (n - 1) : 112 + 15 * (n - 1)] = texture(n, (12, 12))
+    scene.images = np.stack([canvas[:, 10 * t : 10 * t + SIZE[1]] for t in range(5)])
     result = associate(scene, scene.detections(seed=1))
     assert [len(set(numbers_of(result, scene.truth, n))) for n in (1, 2)] == [1, 1]
     scene.images = np.full_like(scene.images, 128)
