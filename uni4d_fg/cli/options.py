@@ -25,6 +25,10 @@ class SolverChoice(str, Enum):
 
 
 SequenceFolder = Annotated[Path, typer.Argument(metavar="SEQ", help="Folder of the sequence.", show_default=False)]
+VideoPath = Annotated[
+    Path,
+    typer.Argument(metavar="SEQ|VIDEO", help="Sequence folder, folder of images, or video file.", show_default=False),
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)]
 Layout = Annotated[LayoutChoice, typer.Option(help="Layout of the sequence; 'auto' looks at what is there.")]
 Depth = Annotated[
@@ -32,6 +36,38 @@ Depth = Annotated[
 ]
 Masks = Annotated[str | None, typer.Option(help="Mask folder (Uni4D's layout).", show_default=False)]
 Tracks = Annotated[str | None, typer.Option(help="Track folder (Uni4D's layout).", show_default=False)]
+DepthFiles = Annotated[
+    str | None,
+    typer.Option("--depth", help="Depth: a name in the sequence, or a folder or .npy file.", show_default=False),
+]
+DepthModel = Annotated[
+    str | None,
+    typer.Option(metavar="CARD[=ONNX]", help="Make depth with a network: its model card.", show_default=False),
+]
+MaskFiles = Annotated[
+    str | None,
+    typer.Option(
+        "--masks", metavar="NAME|FILE|motion|none", help="Masks: a name, a file, from motion, or none.",
+        show_default=False,
+    ),
+]  # fmt: skip
+MaskModel = Annotated[
+    str | None, typer.Option(metavar="CARD[=ONNX]", help="Make masks with a segmenter.", show_default=False)
+]
+Classes = Annotated[str | None, typer.Option(help="Classes that may move, separated by commas.", show_default=False)]
+TrackFiles = Annotated[
+    str | None, typer.Option("--tracks", help="Tracks: a name in the sequence, or an .npz file.", show_default=False)
+]
+TrackModel = Annotated[
+    str | None, typer.Option(metavar="CARD[=ONNX]", help="Make tracks with a network.", show_default=False)
+]
+IntrinsicsFile = Annotated[
+    str | None, typer.Option("--intrinsics", help="Calibration: .npy of a (3, 3) matrix, px.", show_default=False)
+]
+Start = Annotated[int, typer.Option(help="First frame.")]
+Stop = Annotated[int | None, typer.Option(help="First frame that is left out.", show_default=False)]
+Stride = Annotated[int, typer.Option(help="Take every so many frames.")]
+MaxSize = Annotated[int | None, typer.Option(help="Longer side of the images at most, px.", show_default=False)]
 DepthScale = Annotated[float, typer.Option(help="Units per metre of true depth in PNGs (Uni4D's layout).")]
 KnownIntrinsics = Annotated[
     bool, typer.Option("--known-intrinsics", help="Take K.npy instead of the estimate (Uni4D's layout).")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,45 +13,66 @@ from uni4d_fg.cli.console import print_json
 from uni4d_fg.cli.interruption import Interruption, resume_command
 from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
-from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.cli.runs import CUE_FOLDER, SequenceInput, prepare_run_folder
+from uni4d_fg.errors import Cancelled, ConfigError
 
 if TYPE_CHECKING:
     from uni4d_fg.config.models import Config
+    from uni4d_fg.cues.plan import CuePlan, CueReport
     from uni4d_fg.pipeline import RunSummary
-    from uni4d_fg.sequence.model import Sequence
+    from uni4d_fg.sequence.model import Sequence, Video
 
 
 def reconstruct(
-    seq: options.SequenceFolder,
+    seq: options.VideoPath,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME if not given.")] = None,
     config: options.ConfigChoice = None,
     changes: options.Overrides = None,
     solver: options.Solver = None,
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
+    start: options.Start = 0,
+    stop: options.Stop = None,
+    stride: options.Stride = 1,
+    max_size: options.MaxSize = None,
+    depth: options.DepthFiles = None,
+    depth_model: options.DepthModel = None,
+    masks: options.MaskFiles = None,
+    mask_model: options.MaskModel = None,
+    classes: options.Classes = None,
+    tracks: options.TrackFiles = None,
+    track_model: options.TrackModel = None,
+    intrinsics: options.IntrinsicsFile = None,
     layout: options.Layout = LayoutChoice.auto,
-    depth: options.Depth = None,
-    masks: options.Masks = None,
-    tracks: options.Tracks = None,
     depth_gt_scale: options.DepthScale = 1000.0,
     known_intrinsics: options.KnownIntrinsics = False,
     quiet: options.Quiet = False,
     json: options.Json = False,
 ) -> None:
-    """Reconstruct a sequence: cameras, static points, motion and depth, written to a run folder."""
+    """Reconstruct a video: cameras, static points, motion and depth, written to a run folder.
+
+    Cues that the video does not bring are made: depth by a network or from camera motion, masks by a segmenter or from
+    motion, tracks by a network or the built-in tracker.
+    """
     from uni4d_fg.config.load import load_config
 
     chosen = [] if solver is None else [f"solver={solver.value}"]
     settings = load_config(config, [*(changes or ()), *chosen])
     source = SequenceInput.of(
-        seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics
-    )
-    run = out or Path("runs") / seq.resolve().name
-    sequence = source.read()
+        seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics,
+        intrinsics=intrinsics, start=start, stop=stop, stride=stride, max_size=max_size, depth_model=depth_model,
+        mask_model=mask_model, classes=class_list(classes), track_model=track_model,
+    )  # fmt: skip
+    run = out or Path("runs") / (seq.stem if seq.is_file() else seq.resolve().name)
+    opened = source.open()
+    plan = source.plan(opened)
+    plan.check()
     prepare_run_folder(run, resume=resume, overwrite=overwrite)
     source.save(run)
-    summary = run_pipeline(sequence, run, settings, resume=resume, quiet=quiet)
+    sequence, report = run_cues(opened.video, plan, run, settings, quiet=quiet)
+    if report is not None and report.settings is not None:
+        settings = report.settings
+    summary = run_pipeline(sequence, run, settings, resume=resume, quiet=quiet, cues=report)
     if json:
         print_json(summary.to_dict())
     else:
@@ -84,7 +106,46 @@ def demo(
         typer.echo("\n".join(demonstration.demo_lines(out, sequence, summary, report)))
 
 
-def run_pipeline(sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool) -> RunSummary:
+def run_cues(
+    video: Video, plan: CuePlan, run: Path, config: Config, *, quiet: bool
+) -> tuple[Sequence, CueReport | None]:
+    """Make the cues that are missing, with progress, in ``RUN/cues``; None when there was nothing to make.
+
+    Raises:
+        Uni4dFgError: As :func:`~uni4d_fg.cues.gather.gather_cues`.
+    """
+    from uni4d_fg.cues.gather import gather_cues
+    from uni4d_fg.sequence.assemble import as_sequence
+
+    if plan.is_given:
+        return as_sequence(replace(video, masks=None) if plan.masks == "none" else video), None
+    folder = run / CUE_FOLDER
+    with Interruption() as stop, progress_reporter(quiet) as reporter:
+        try:
+            return gather_cues(
+                video, plan, folder, config, reporter=reporter, should_stop=stop, track_cache=run / "stages"
+            )
+        except Cancelled as error:
+            raise Cancelled(f"{error}; what is done is in {folder}; continue with: {resume_command()}") from error
+
+
+def class_list(classes: str | None) -> tuple[str, ...] | None:
+    """Return the names in a list that is separated by commas.
+
+    Raises:
+        ConfigError: If there is no name in it.
+    """
+    if classes is None:
+        return None
+    names = tuple(name.strip() for name in classes.split(",") if name.strip())
+    if not names:
+        raise ConfigError(f"--classes {classes!r}: give names separated by commas, such as person,dog")
+    return names
+
+
+def run_pipeline(
+    sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None
+) -> RunSummary:
     """Reconstruct with progress; Ctrl-C ends the run cleanly and says how to go on.
 
     Raises:
@@ -94,6 +155,9 @@ def run_pipeline(sequence: Sequence, run: Path, config: Config, *, resume: bool,
 
     with Interruption() as stop, progress_reporter(quiet) as reporter:
         try:
-            return reconstruct_sequence(sequence, run, config, resume=resume, reporter=reporter, should_stop=stop)
+            return reconstruct_sequence(
+                sequence, run, config, resume=resume, reporter=reporter, should_stop=stop,
+                cues=None if cues is None else cues.to_dict(),
+            )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"finished stages are kept in {run}; continue with: {resume_command()}") from error

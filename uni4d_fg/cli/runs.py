@@ -1,55 +1,201 @@
-"""Guarding run folders, and remembering which sequence a run was made from."""
+"""Guarding run folders, and remembering which video a run was made from."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from uni4d_fg.cli.options import LayoutChoice
-from uni4d_fg.errors import InputError, OutputError
+from uni4d_fg.cues.manifest import MANIFEST, has_manifest, load_cues
+from uni4d_fg.cues.plan import CueFiles, CuePlan, plan_cues
+from uni4d_fg.errors import ConfigError, InputError, OutputError
 from uni4d_fg.files import atomic_write_json, write_failure
 from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.sequence.read import read_sequence
+from uni4d_fg.sequence.assemble import as_sequence
+from uni4d_fg.sequence.layout import Layout, LayoutOptions
+from uni4d_fg.sequence.model import Sequence, Video
+from uni4d_fg.sequence.open_video import open_video
+from uni4d_fg.sequence.read import detect_layout, read_sequence
+from uni4d_fg.sequence.selection import FrameSelection, select_frames
 
 STORED_INPUT = "input.json"
 DEMO_SEQUENCE = "sequence"
+CUE_FOLDER = "cues"
+
+_MADE_MASKS = ("motion", "none")
+
+
+@dataclass(frozen=True)
+class OpenedInput:
+    """A video as the command line asked for it, before its cues are made."""
+
+    video: Video
+    bare: bool
+    """It is frames only: a video file, or images without a depth cue of their own."""
 
 
 @dataclass(frozen=True)
 class SequenceInput:
-    """How a sequence was asked for on the command line; kept beside a run's results."""
+    """What was asked for on the command line; kept beside a run's results."""
 
     root: str
-    layout: str = "auto"
+    layout: Layout = "auto"
     depth: str | None = None
     masks: str | None = None
     tracks: str | None = None
     depth_gt_scale: float = 1000.0
     known_intrinsics: bool = False
+    intrinsics: str | None = None
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+    max_size: int | None = None
+    depth_model: str | None = None
+    mask_model: str | None = None
+    classes: tuple[str, ...] | None = None
+    track_model: str | None = None
+    cues: str | None = field(default=None, compare=False)
+    """Folder of the cues that were made for it, if any; not written down."""
 
     @classmethod
     def of(
         cls, root: Path, layout: LayoutChoice, depth: str | None, masks: str | None, tracks: str | None, *,
-        depth_gt_scale: float, known_intrinsics: bool,
+        depth_gt_scale: float, known_intrinsics: bool, **more: Any,
     ) -> SequenceInput:  # fmt: skip
-        """Take over command-line values; the folder becomes absolute."""
-        return cls(str(root.resolve()), layout.value, depth, masks, tracks, depth_gt_scale, known_intrinsics)
+        """Take over command-line values; paths become absolute.
+
+        Args:
+            root: Sequence folder, folder of images, or video file.
+            layout: Of a sequence folder.
+            depth: Name of a cue of the sequence, or a file or folder beside it.
+            masks: The same; or 'motion' or 'none'.
+            tracks: The same.
+            depth_gt_scale: Units per metre of true depth in PNGs (Uni4D's layout).
+            known_intrinsics: Take ``K.npy`` instead of the estimate (Uni4D's layout).
+            more: The other fields.
+        """
+        root = root.resolve()
+        more["intrinsics"] = _absolute(root, more.get("intrinsics"))
+        return cls(
+            str(root), layout.value, _absolute(root, depth), _absolute(root, masks), _absolute(root, tracks),
+            depth_gt_scale, known_intrinsics, **more,
+        )  # fmt: skip
 
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments of :func:`read_sequence` and :func:`validate_sequence`."""
-        return {name: value for name, value in asdict(self).items() if name != "root"}
+        names = ("layout", "depth", "masks", "tracks", "depth_gt_scale", "known_intrinsics")
+        return {name: getattr(self, name) for name in names}
+
+    def open(self) -> OpenedInput:
+        """Open the video with the cues that come with it. Raises InputError."""
+        root = Path(self.root)
+        options, files = self._sources()
+        selection = FrameSelection(self.start, self.stop, self.stride, self.max_size)
+        if not files:
+            video = open_video(root, selection, self.layout, **options)
+            return OpenedInput(video, root.is_file() or video.depths is None)
+        video = open_video(root, layout=self.layout, **options)
+        bare = root.is_file() or video.depths is None
+        return OpenedInput(select_frames(files.attach(video), selection), bare)
+
+    def plan(self, opened: OpenedInput) -> CuePlan:
+        """Decide where the cues come from.
+
+        Raises:
+            ConfigError: If options contradict each other.
+        """
+        of_file = self.masks is not None and self.masks not in _MADE_MASKS
+        if of_file and self.mask_model is not None:
+            raise ConfigError("--masks and --mask-model both say where masks come from; give one of them")
+        if self.depth is not None and self.depth_model is not None:
+            raise ConfigError("--depth and --depth-model both say where depth comes from; give one of them")
+        if self.tracks is not None and self.track_model is not None:
+            raise ConfigError("--tracks and --track-model both say where tracks come from; give one of them")
+        if self.classes is not None and self.mask_model is None and not of_file:
+            raise ConfigError("--classes says which classes of a segmenter may move; choose one with --mask-model")
+        return plan_cues(
+            opened.video,
+            bare=opened.bare,
+            depth_model=self.depth_model,
+            masks=self.masks if self.masks in _MADE_MASKS else None,
+            mask_model=self.mask_model,
+            classes=self.classes,
+            track_model=self.track_model,
+        )
 
     def read(self) -> Sequence:
-        """Read the sequence. Raises InputError."""
-        return read_sequence(Path(self.root), **self.arguments())
+        """Open the sequence with all its cues; none is made here.
+
+        Raises:
+            InputError: If it cannot be read, or a cue is missing.
+        """
+        if self.cues is not None and has_manifest(Path(self.cues)):
+            return load_cues(self.open().video, Path(self.cues))[0]
+        if self == SequenceInput(self.root, **self.arguments()) and self.masks not in _MADE_MASKS:
+            options, files = self._sources()
+            if not files:
+                return read_sequence(Path(self.root), self.layout, **options)
+        video = self.open().video
+        return as_sequence(replace(video, masks=None) if self.masks == "none" else video)
 
     def save(self, run: Path) -> None:
         """Write it into a run's folder. Raises OutputError."""
-        atomic_write_json(run / STORED_INPUT, asdict(self))
+        stored = asdict(self)
+        del stored["cues"]
+        atomic_write_json(run / STORED_INPUT, stored)
+
+    def _sources(self) -> tuple[LayoutOptions, CueFiles]:
+        """Tell the names of cues within a sequence folder from files elsewhere."""
+        root = Path(self.root)
+        options = LayoutOptions(depth_gt_scale=self.depth_gt_scale, known_intrinsics=self.known_intrinsics)
+        files: dict[str, Path] = {}
+        if self.depth is not None:
+            if _is_named_in(root, self.depth):
+                options["depth"] = self.depth
+            else:
+                files["depth"] = Path(self.depth)
+        uni4d = root.is_dir() and (self.layout == "uni4d" or (self.layout == "auto" and self._looks_like_uni4d()))
+        if self.masks is not None and self.masks not in _MADE_MASKS:
+            if uni4d and _is_named_in(root, self.masks):
+                options["masks"] = self.masks
+            else:
+                files["masks"] = _beside(root, self.masks)
+        if self.tracks is not None:
+            if uni4d and _is_named_in(root, self.tracks):
+                options["tracks"] = self.tracks
+            else:
+                files["tracks"] = _beside(root, self.tracks)
+        if self.intrinsics is not None:
+            files["intrinsics"] = _beside(root, self.intrinsics)
+        return options, CueFiles(**files, classes=self.classes)
+
+    def _looks_like_uni4d(self) -> bool:
+        named = self.depth if self.depth is not None and _is_named_in(Path(self.root), self.depth) else None
+        return detect_layout(Path(self.root), named) == "uni4d"
+
+
+def _absolute(root: Path, value: str | None) -> str | None:
+    """Return a cue's name as it is, and the path of a file elsewhere as an absolute one."""
+    if value is None or value in _MADE_MASKS or _is_named_in(root, value):
+        return value
+    path = Path(value).expanduser()
+    return str(path.resolve()) if path.exists() else value
+
+
+def _is_named_in(root: Path, value: str) -> bool:
+    """Tell whether ``value`` can only be a name within the folder ``root``: it is there, or nowhere else either."""
+    if not root.is_dir() or Path(value).is_absolute():
+        return False
+    return (root / value).exists() or (root / f"{value}.npy").exists() or not Path(value).expanduser().exists()
+
+
+def _beside(root: Path, value: str) -> Path:
+    """Return the file of that name in the sequence folder, if there is one, else the path as it is."""
+    inside = root / value
+    return inside if root.is_dir() and inside.exists() else Path(value)
 
 
 def is_run(folder: Path) -> bool:
@@ -61,7 +207,7 @@ def is_run(folder: Path) -> bool:
         stored = _read_json(folder / STORED_INPUT)
     except InputError:
         return False
-    return set(stored) == {field.name for field in fields(SequenceInput)}
+    return {"root", "layout"} <= set(stored) <= {field.name for field in fields(SequenceInput)}
 
 
 def prepare_run_folder(folder: Path, *, resume: bool, overwrite: bool) -> None:
@@ -86,13 +232,16 @@ def prepare_run_folder(folder: Path, *, resume: bool, overwrite: bool) -> None:
 
 
 def remove_results(folder: Path) -> None:
-    """Remove what runs write, and nothing else.
+    """Remove what runs write, and nothing else; maps of networks stay, as they go by content and take long to make.
 
     Raises:
         OutputError: If something cannot be removed.
     """
     run = RunFolder(folder)
-    files = (run.reconstruction, run.trajectory, run.depth, run.summary, run.config, run.labels, folder / STORED_INPUT)
+    files = (
+        run.reconstruction, run.trajectory, run.depth, run.summary, run.config, run.labels, folder / STORED_INPUT,
+        folder / CUE_FOLDER / MANIFEST,
+    )  # fmt: skip
     try:
         for path in files:
             path.unlink(missing_ok=True)
@@ -104,7 +253,7 @@ def remove_results(folder: Path) -> None:
 
 
 def stored_input(folder: Path) -> SequenceInput:
-    """Return which sequence a run was made from.
+    """Return which video a run was made from, with the cues that were made for it.
 
     Raises:
         InputError: If ``folder`` is no run, or the run does not say.
@@ -119,6 +268,8 @@ def stored_input(folder: Path) -> SequenceInput:
         stored = {"root": sequence.get("root")} if isinstance(sequence, dict) else {}
     else:
         raise InputError(f"{folder}: is not the folder of a finished run; it has no {summary.name}")
+    if isinstance(stored.get("classes"), list):
+        stored["classes"] = tuple(stored["classes"])
     try:
         result = SequenceInput(**stored)
     except TypeError:
@@ -126,9 +277,9 @@ def stored_input(folder: Path) -> SequenceInput:
     if not result.root or not isinstance(result.root, str):
         raise InputError(f"{folder}: does not say which sequence it was made from; give it with --sequence")
     own = folder / DEMO_SEQUENCE
-    if not Path(result.root).is_dir() and own.is_dir():
+    if not Path(result.root).exists() and own.is_dir():
         return SequenceInput(str(own))
-    return result
+    return replace(result, cues=str(folder / CUE_FOLDER))
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -132,6 +132,10 @@ class FrameCache:
         """Say that all frames are there. Raises OutputError."""
         atomic_write_text(self.folder / "complete", "")
 
+    def is_complete(self) -> bool:
+        """Tell whether :meth:`mark_complete` was called."""
+        return (self.folder / "complete").is_file()
+
     def clear(self) -> None:
         """Remove the folder with all that is in it."""
         shutil.rmtree(self.folder, ignore_errors=True)

@@ -22,6 +22,8 @@ from uni4d_fg.errors import ConfigError, InputError
 MODELS_VARIABLE = "UNI4D_FG_MODELS"
 """Environment variable that names a folder of ONNX files, which is looked into first."""
 
+CardKind = Literal["depth", "segmentation", "tracks"]
+
 _SUFFIXES = (".yaml", ".yml")
 
 
@@ -112,7 +114,7 @@ class IntrinsicsOutput(Section):
 class BaseCard(Section):
     """What every card has."""
 
-    kind: Literal["depth", "segmentation", "tracks"] = required("What the network makes.")
+    kind: CardKind = required("What the network makes.")
     title: str = required("Name of the network, for messages.")
     file: str = required("ONNX file, relative to the folder of the card or to that of UNI4D_FG_MODELS.")
     sha256: str | None = setting(None, "SHA-256 of the file, hexadecimal; null: not checked.")
@@ -265,7 +267,7 @@ def load_card(path: Path) -> Card:
     return card  # type: ignore[no-any-return]
 
 
-def find_model(choice: str, kind: Literal["depth", "segmentation", "tracks"]) -> ModelFile:
+def find_model(choice: str, kind: CardKind) -> ModelFile:
     """Find a card and its ONNX file from what was said on the command line.
 
     Args:

@@ -181,16 +181,29 @@ def store_labels(
     Raises:
         OutputError: If one cannot be written.
     """
-    paths = tuple(folder / f"{frame:06d}.png" for frame in range(count))
-    done = folder / "complete"
-    if not done.is_file() or not all(path.is_file() for path in paths):
+    if not labels_are_stored(folder, count):
+        paths = _label_paths(folder, count)
         reporter.begin(task, count)
         for frame, mask in enumerate(labels):
             write_labels(paths[frame], mask)
             reporter.advance(frame + 1)
         FrameCache(folder).mark_complete()
         reporter.end()
-    return MaskFolder(paths, size)
+    return open_labels(folder, count, size)
+
+
+def labels_are_stored(folder: Path, count: int) -> bool:
+    """Tell whether all label maps of a video are there."""
+    return FrameCache(folder).is_complete() and all(path.is_file() for path in _label_paths(folder, count))
+
+
+def open_labels(folder: Path, count: int, size: tuple[int, int]) -> MaskFolder:
+    """Open the label maps that :func:`store_labels` wrote."""
+    return MaskFolder(_label_paths(folder, count), size)
+
+
+def _label_paths(folder: Path, count: int) -> tuple[Path, ...]:
+    return tuple(folder / f"{frame:06d}.png" for frame in range(count))
 
 
 def store_maps(

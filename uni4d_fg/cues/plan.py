@@ -6,7 +6,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from uni4d_fg.sequence.assemble import check_count, open_depth, open_masks
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.card import CardKind, find_model
+from uni4d_fg.cues.mask_files import open_mask_files
+from uni4d_fg.cues.session import weights_hash
+from uni4d_fg.optional import import_onnxruntime
+from uni4d_fg.sequence.assemble import check_count, open_depth
 from uni4d_fg.sequence.calibration import load_intrinsics
 from uni4d_fg.sequence.model import Video
 from uni4d_fg.sequence.problems import SequenceProblem
@@ -24,11 +29,13 @@ class CueFiles:
     depth: Path | None = None
     """Folder of depth maps, or one ``.npy`` file, as in the native layout."""
     masks: Path | None = None
-    """Masks in any of the known forms."""
+    """Masks in any form that :mod:`uni4d_fg.cues.mask_files` knows."""
     tracks: Path | None = None
     """``.npz`` file of tracks in any of the known forms."""
     intrinsics: Path | None = None
     """``.npy`` file of one (3, 3) matrix, or one per frame."""
+    classes: tuple[str, ...] | None = None
+    """Of ``masks``: names of the classes that may move."""
 
     def attach(self, video: Video) -> Video:
         """Return the video, whole and in its own size, with these cues.
@@ -45,11 +52,9 @@ class CueFiles:
             depths[0]
             changes["depths"] = depths
         if self.masks is not None:
-            _check_exists(self.masks)
-            masks = open_masks(self.masks, size)
-            check_count(self.masks, len(masks), count)
-            masks[0]
-            changes["masks"] = masks
+            changes["masks"] = open_mask_files(
+                self.masks, size, count, video.frame_names, images=video.images, classes=self.classes
+            )
         if self.tracks is not None:
             changes["tracks"] = load_track_file(self.tracks, count).to_tracks(count, size)
         if self.intrinsics is not None:
@@ -87,6 +92,22 @@ class CuePlan:
             and self.tracks in ("given", "built_in")
             and not self.keep_built_in_tracks
         )
+
+    def check(self) -> None:
+        """Make sure that cards are right and their ONNX files there, before anything is begun.
+
+        Raises:
+            ConfigError: If a card is wrong.
+            InputError: If an ONNX file is missing or not the one that its card names.
+            MissingDependencyError: If ONNX Runtime is needed and not installed.
+        """
+        chosen: list[tuple[str | None, CardKind]] = [
+            (self.depth_model, "depth"), (self.mask_model, "segmentation"), (self.track_model, "tracks")
+        ]  # fmt: skip
+        for model, kind in chosen:
+            if model is not None:
+                import_onnxruntime()
+                weights_hash(find_model(model, kind))
 
 
 def plan_cues(
@@ -140,6 +161,8 @@ class CueReport:
     warnings: list[str] = field(default_factory=list)
     metric: bool = True
     """Whether depth is in metres."""
+    settings: Config | None = None
+    """The configuration to reconstruct with, where these cues ask for another one."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""

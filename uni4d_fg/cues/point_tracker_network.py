@@ -223,7 +223,7 @@ class PointTrackerNetwork:
         if kind == "probability":
             return numbers
         sign = np.float32(1.0 if kind in ("occlusion_logit", "error_logit") else -1.0)
-        return 1 / (1 + np.exp(np.clip(sign * numbers, -80, 80)))
+        return np.asarray(1 / (1 + np.exp(np.clip(sign * numbers, -80, 80))), np.float32)
 
 
 def query_grid(image_size: tuple[int, int], config: NetworkConfig) -> Float32Array:

@@ -38,12 +38,14 @@ class Placement:
     def to_input(self, uv: FloatArray) -> FloatArray:
         """Map (..., 2) pixels of the image to pixels of the input (centres at integers in both)."""
         top, left = self.content[:2]
-        return (uv + 0.5) * self.scale - 0.5 + np.array([left, top])
+        at_input: FloatArray = (uv + 0.5) * self.scale - 0.5 + np.array([left, top])
+        return at_input
 
     def to_image(self, uv: FloatArray) -> FloatArray:
         """Map (..., 2) pixels of the input to pixels of the image."""
         top, left = self.content[:2]
-        return (uv + 0.5 - np.array([left, top])) / self.scale - 0.5
+        at_image: FloatArray = (uv + 0.5 - np.array([left, top])) / self.scale - 0.5
+        return at_image
 
     def intrinsics_to_image(self, intrinsics: FloatArray) -> FloatArray:
         """Map (4,) fx, fy, cx, cy of the input to those of the image."""
@@ -129,9 +131,8 @@ def prepare(image: ImageArray, placement: Placement, spec: InputSpec, size: Size
     if spec.color == "bgr":
         canvas = canvas[:, :, ::-1]
     if spec.type != "uint8":
-        canvas = (canvas * np.float32(spec.scale) - np.asarray(spec.mean, np.float32)) / np.asarray(
-            spec.std, np.float32
-        )
+        mean, std = np.array(spec.mean, np.float32), np.array(spec.std, np.float32)
+        canvas = ((canvas * np.float32(spec.scale) - mean) / std).astype(np.float32)
     ordered = canvas.transpose(2, 0, 1) if spec.layout == "NCHW" else canvas
     return np.ascontiguousarray(ordered).astype(_TYPES[spec.type])
 

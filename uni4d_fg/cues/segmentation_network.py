@@ -183,7 +183,7 @@ def _outputs(card: SegmentationCard) -> tuple[str, ...]:
 
 def _activated(values: Float32Array, activation: str) -> Float32Array:
     if activation == "sigmoid":
-        return 1 / (1 + np.exp(-values))
+        return np.asarray(1 / (1 + np.exp(-values)), np.float32)
     if activation == "softmax":
         powers = np.exp(values - values.max(axis=0))
         result: Float32Array = powers / powers.sum(axis=0)

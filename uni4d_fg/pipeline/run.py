@@ -23,15 +23,18 @@ from uni4d_fg.pipeline.solver import solver_facts, solver_settings, stage_runner
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
+from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.reconstruction.depth_store import read_depth
 from uni4d_fg.reconstruction.labels_io import load_labels, save_labels
 from uni4d_fg.reconstruction.run_folder import RunFolder
 from uni4d_fg.sequence.model import Sequence
 from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.stages.stage import StageRunner
 from uni4d_fg.tracks.cache import load_or_track
 from uni4d_fg.tracks.labels import label_tracks
 from uni4d_fg.tracks.model import LabelledTracks
+from uni4d_fg.windows.plan import Window, windows_of
 
 ValueT = TypeVar("ValueT")
 
@@ -97,6 +100,7 @@ def reconstruct(
     resume: bool = False,
     reporter: Reporter | None = None,
     should_stop: Callable[[], bool] | None = None,
+    cues: dict[str, Any] | None = None,
 ) -> RunSummary:
     """Reconstruct a sequence and write the run folder.
 
@@ -107,6 +111,7 @@ def reconstruct(
         resume: Take over stages stored in ``run_dir`` whose inputs and configuration have not changed.
         reporter: Progress.
         should_stop: Polled often; True ends the run with :class:`Cancelled`, finished stages kept.
+        cues: What was made of the cues, for the summary: ``sources``, ``facts``, ``warnings``, ``metric``.
 
     Returns:
         The summary that is also written as ``summary.json``.
@@ -121,6 +126,7 @@ def reconstruct(
     """
     check_sequence(sequence)
     run_stage = stage_runner(config)
+    windows = windows_of(config, sequence.num_frames)
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
     summary = RunSummary(
@@ -131,6 +137,8 @@ def reconstruct(
             "image_size": [height, width],
         },
         solver_facts(config),
+        cues=cues or {},
+        warnings=list((cues or {}).get("warnings", [])),
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
@@ -143,15 +151,7 @@ def reconstruct(
     key = stage_key(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
-    cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
-    key = stage_key(key, config.bundle_adjustment)
-    scene = run.step(
-        "bundle_adjustment",
-        key,
-        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage),
-    )
-    key = stage_key(key, config.nonrigid)
-    motion = run.step("nonrigid", key, lambda hooks: nonrigid_step(labelled, scene, config, hooks, run_stage))
+    key, scene, motion = _stages(run, key, labelled, windows, run_stage)
     key = stage_key(key, config.fusion)
     _fuse(run, key, labelled, scene, motion)
     reconstruction = assemble(sequence, labelled, scene, motion)
@@ -163,6 +163,34 @@ def reconstruct(
     run._note("output", {}, time.perf_counter() - began, False)
     atomic_write_json(folder.summary, summary.to_dict())
     return summary
+
+
+def _stages(
+    run: _Run, key: str, labelled: LabelledTracks, windows: list[Window], run_stage: StageRunner
+) -> tuple[str, Arrays, Arrays]:
+    """Run stages 1 to 3, as one graph or in windows; return the key so far and the records of stages 2 and 3."""
+    sequence, config = run.sequence, run.config
+    if windows:
+        parts = WindowedRun(
+            sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
+            run.reporter, run.should_stop,
+        )  # fmt: skip
+        key = stage_key(key, config.bundle_adjustment, config.windows)
+        before = key
+        scene = run.step("bundle_adjustment", key, lambda hooks: scene_step(parts, before, hooks))
+        key = stage_key(key, config.nonrigid)
+        after = key
+        return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
+    cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
+    key = stage_key(key, config.bundle_adjustment)
+    scene = run.step(
+        "bundle_adjustment",
+        key,
+        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage),
+    )
+    key = stage_key(key, config.nonrigid)
+    motion = run.step("nonrigid", key, lambda hooks: nonrigid_step(labelled, scene, config, hooks, run_stage))
+    return key, scene, motion
 
 
 def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:

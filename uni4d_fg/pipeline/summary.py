@@ -26,12 +26,15 @@ class RunSummary:
     """Per stage: seconds, peak memory, whether it was resumed, solves, dropped counts."""
     warnings: list[str] = field(default_factory=list)
     """What to distrust, one sentence each."""
+    cues: dict[str, Any] = field(default_factory=dict)
+    """Where cues came from that the video did not bring: ``sources``, ``facts``, ``warnings``, ``metric``."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         return {
             "sequence": self.sequence,
             "solver": self.solver,
+            **({"cues": self.cues} if self.cues else {}),
             "stages": self.stages,
             "warnings": self.warnings,
             "versions": versions(),
@@ -40,6 +43,9 @@ class RunSummary:
     def lines(self) -> list[str]:
         """Return one screen of text."""
         out = [f"{self.sequence['name']}: {self.sequence['num_frames']} frames"]
+        if self.cues:
+            out.append("cues: " + "; ".join(f"{cue} {source}" for cue, source in self.cues["sources"].items()))
+            out += [f"    {text}" for text in self.cues["facts"]]
         for name, stage in self.stages.items():
             resumed = " (resumed)" if stage.get("resumed") else ""
             out.append(f"{name}{resumed}: {stage.get('seconds', 0.0):.1f} s, {stage.get('peak_memory_mb', 0):.0f} MB")

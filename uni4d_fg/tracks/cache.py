@@ -10,7 +10,7 @@ import numpy as np
 from uni4d_fg.arrays import ImageArray
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.sequence.model import FrameSource, Sequence
+from uni4d_fg.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.tracks.io import load_tracks, save_tracks
 from uni4d_fg.tracks.lucas_kanade import Progress, ShouldStop, track_grid
 from uni4d_fg.tracks.model import Tracks
@@ -36,7 +36,7 @@ def cache_key(images: FrameSource[ImageArray], config: TrackingConfig, should_st
 
 
 def load_or_track(
-    sequence: Sequence,
+    sequence: Sequence | Video,
     config: TrackingConfig,
     cache_dir: Path | None,
     progress: Progress | None = None,

@@ -1,0 +1,271 @@
+"""From a video to a sequence: cues that did not come with it are made, stored and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.cache import FloatMaps
+from uni4d_fg.cues.geometric_depth import settings_for_geometry
+from uni4d_fg.cues.geometry_makers import aligned_depth, geometric_depth, moving_masks, video_key
+from uni4d_fg.cues.intrinsics import shared_intrinsics
+from uni4d_fg.cues.manifest import save_manifest
+from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_masks, network_tracks
+from uni4d_fg.cues.plan import CuePlan, CueReport
+from uni4d_fg.errors import ConfigError
+from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.sequence.assemble import as_sequence
+from uni4d_fg.sequence.calibration import guess_intrinsics
+from uni4d_fg.sequence.frames import no_masks
+from uni4d_fg.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.tracks.cache import load_or_track
+from uni4d_fg.tracks.model import Tracks
+
+NOT_METRIC = (
+    "depth is not metric: no depth was given, so it was found from the motion of the camera, which does not see scale; "
+    "all lengths are in a unit of its own"
+)
+NOT_METRIC_RELATIVE = (
+    "depth is not metric: the depth network gives relative depth, which was scaled to the motion of the camera; all "
+    "lengths are in a unit of its own"
+)
+
+
+def gather_cues(
+    video: Video,
+    plan: CuePlan,
+    folder: Path,
+    config: Config,
+    *,
+    reporter: Reporter | None = None,
+    should_stop: Callable[[], bool] | None = None,
+    track_cache: Path | None = None,
+) -> tuple[Sequence, CueReport]:
+    """Make the cues that a video lacks.
+
+    Args:
+        video: Frames, and the cues that came with them.
+        plan: Where every cue comes from.
+        folder: Keeps what is made, frame by frame; what is there and fits is not made again. Not touched when
+            nothing is to be made.
+        config: Networks, tracker, geometry and motion masks.
+        reporter: Progress.
+        should_stop: Polled often.
+        track_cache: Folder of the built-in tracker's memory; ``folder`` if not given.
+
+    Returns:
+        The video with all its cues, and what was made of what.
+
+    Raises:
+        ConfigError: If a model card is wrong, or the plan asks for a cue that is not there.
+        InputError: If a frame, a cue or a network cannot be used.
+        DegenerateProblemError: If depth or masks from motion are asked for and the motion does not determine them.
+        MissingDependencyError: If ONNX Runtime is needed and not installed.
+        OutputError: If ``folder`` cannot be written.
+        Cancelled: If ``should_stop`` turned true; frames that are done are kept.
+    """
+    work = _Gathering(
+        video, plan, folder, config, reporter or SilentReporter(), should_stop or (lambda: False), track_cache or folder
+    )
+    return work.run()
+
+
+class _Gathering:
+    """One video on its way to a sequence."""
+
+    def __init__(
+        self, video: Video, plan: CuePlan, folder: Path, config: Config, reporter: Reporter,
+        should_stop: Callable[[], bool], track_cache: Path,
+    ) -> None:  # fmt: skip
+        self.video, self.plan, self.folder, self.config = video, plan, folder, config
+        self.reporter, self.should_stop, self.track_cache = reporter, should_stop, track_cache
+        self.report = CueReport()
+        self.tracks = video.tracks if plan.tracks == "given" else None
+        self.track_file: Path | None = None
+        self.intrinsics = video.intrinsics
+        self.world_T_cam = video.initial_world_T_cam
+        self.motion_facts: list[str] = []
+        self.motion_warnings: list[str] = []
+        self._video_key: str | None = None
+
+    def run(self) -> tuple[Sequence, CueReport]:
+        plan, report = self.plan, self.report
+        self._sources()
+        if plan.tracks == "card":
+            self._network_tracks()
+        masks = self._known_masks()
+        network = self._network_depth() if plan.depth == "card" else None
+        depths: FrameSource[Float32Array] | None = self.video.depths if plan.depth == "given" else None
+        if network is not None and not network.is_affine:
+            depths = network.maps
+        if depths is None:
+            depths = self._scaled_by_motion(network, masks)
+        if masks is None:
+            masks = self._motion_masks(depths)
+            if plan.depth == "geometry" or (network is not None and network.is_affine):
+                # What moves is known now, and was in the way of the cameras before.
+                depths = self._scaled_by_motion(network, masks)
+        if plan.keep_built_in_tracks:
+            self._any_tracks()
+        intrinsics = self.intrinsics
+        if intrinsics is None:
+            intrinsics = guess_intrinsics(self.video.image_size)
+            report.sources["intrinsics"] = "guessed from the image size"
+        report.facts += self.motion_facts
+        report.warnings[:0] = self.motion_warnings
+        sequence = as_sequence(
+            replace(
+                self.video, depths=depths, masks=masks, intrinsics=intrinsics, tracks=self.tracks,
+                initial_world_T_cam=self.world_T_cam,
+            )
+        )  # fmt: skip
+        if not plan.is_given:
+            save_manifest(self.folder, self.video, sequence, plan, report, self.track_file)
+        return sequence, report
+
+    def _sources(self) -> None:
+        video, plan, sources = self.video, self.plan, self.report.sources
+        for cue, source, there in (
+            ("depth", plan.depth, video.depths is not None),
+            ("masks", plan.masks, video.masks is not None),
+            ("tracks", plan.tracks, video.tracks is not None),
+        ):
+            if source == "given" and not there:
+                raise ConfigError(f"{video.name}: {cue} are to be taken as given, but the video brings none")
+            sources[cue] = {
+                "given": "given", "none": "none, everything is static", "built_in": "built-in tracker",
+                "motion": "from motion", "geometry": "from camera motion", "card": "network",
+            }[source]  # fmt: skip
+        sources["intrinsics"] = "given" if video.intrinsics is not None else "not known"
+
+    def _network_tracks(self) -> None:
+        assert self.plan.track_model is not None
+        self.tracks, title, self.track_file = network_tracks(
+            self.video, self.plan.track_model, self.folder, self.config.networks, self.reporter, self.should_stop
+        )
+        self.report.sources["tracks"] = title
+        self.report.facts.append(f"tracks: {self.tracks.num_tracks} by {title}")
+
+    def _known_masks(self) -> FrameSource[Int32Array] | None:
+        """Return the masks that need no depth, or None when they come from motion."""
+        plan, video = self.plan, self.video
+        if plan.masks == "motion":
+            return None
+        if plan.masks == "none":
+            return no_masks(video.image_size, video.num_frames)
+        if plan.masks == "given":
+            return video.masks
+        assert plan.mask_model is not None
+        masks, title, count = network_masks(
+            video, plan.mask_model, plan.classes, self.folder, self.config.networks,
+            self.config.motion_masks.instances, self.reporter, self.should_stop,
+        )  # fmt: skip
+        self.report.sources["masks"] = title
+        self.report.facts.append(f"masks: {count} instances by {title}")
+        if count == 0:
+            self.report.warnings.append(f"{title} finds nothing that may move: everything is taken for static")
+        return masks
+
+    def _network_depth(self) -> NetworkDepth:
+        video, plan, report = self.video, self.plan, self.report
+        assert plan.depth_model is not None
+        known = self.intrinsics is not None
+        intrinsics = guess_intrinsics(video.image_size) if self.intrinsics is None else self.intrinsics
+        found = network_depth(
+            video, plan.depth_model, float(intrinsics[0]), known, self.folder, self.config.networks, self.reporter,
+            self.should_stop,
+        )  # fmt: skip
+        report.sources["depth"] = found.title
+        if found.assumed_focal:
+            report.warnings.append(
+                f"{found.title} scales depth by the focal length, which is not known and was guessed: depth is metric "
+                "only as far as the guess is right; give a calibration (K.npy)"
+            )
+        shared = None if known else shared_intrinsics(found.per_frame_intrinsics)
+        if shared is not None:
+            self.intrinsics = shared.intrinsics
+            report.sources["intrinsics"] = found.title
+            report.facts.append(
+                f"intrinsics: fx {shared.intrinsics[0]:.1f} fy {shared.intrinsics[1]:.1f} px from {shared.used} frames "
+                f"of {found.title}, which agree to {100 * shared.spread:.1f} %"
+            )
+            report.warnings += shared.warnings()
+        return found
+
+    def _scaled_by_motion(
+        self, network: NetworkDepth | None, masks: FrameSource[Int32Array] | None
+    ) -> FrameSource[Float32Array]:
+        """Return depth up to scale: from camera motion alone, or a network's relative depth scaled by it."""
+        tracks, video, report = self._any_tracks(), self.video, self.report
+        static = np.ones(tracks.num_tracks, bool) if masks is None else static_tracks(tracks, masks)
+        start = guess_intrinsics(video.image_size) if self.intrinsics is None else self.intrinsics
+        found = geometric_depth(
+            replace(video, masks=masks), tracks, static, start, self._key(), self.folder, self.config, self.reporter,
+            self.should_stop,
+        )  # fmt: skip
+        report.metric = False
+        self.intrinsics = found.intrinsics
+        if video.intrinsics is None:
+            report.sources["intrinsics"] = "from camera motion"
+        self.motion_facts = [f"depth: {fact}" for fact in found.facts]
+        if network is None:
+            self.motion_warnings = [NOT_METRIC, *found.warnings]
+            report.settings = settings_for_geometry(self.config, found)
+            self.world_T_cam = found.world_T_cam
+            return found.depths
+        self.motion_warnings = [NOT_METRIC_RELATIVE, *found.warnings]
+        depths, facts = aligned_depth(
+            network.maps, tracks, found, static, self._key(), self.folder, self.config, self.reporter, self.should_stop
+        )
+        self.motion_facts += facts
+        return depths
+
+    def _motion_masks(self, depths: FrameSource[Float32Array]) -> FrameSource[Int32Array]:
+        tracks = self._any_tracks()
+        start = guess_intrinsics(self.video.image_size) if self.intrinsics is None else self.intrinsics
+        masks, facts, warnings = moving_masks(
+            self.video, depths, tracks, start, self._key(), _name_of(depths), self.folder, self.config, self.reporter,
+            self.should_stop,
+        )  # fmt: skip
+        self.report.facts += [f"masks: {fact}" for fact in facts]
+        self.report.warnings += warnings
+        return masks
+
+    def _key(self) -> str:
+        if self._video_key is None:
+            self._video_key = video_key(self.video, self.should_stop)
+        return self._video_key
+
+    def _any_tracks(self) -> Tracks:
+        """Return tracks, by the built-in tracker where there are none."""
+        if self.tracks is None:
+            total = 2 * (self.video.num_frames - 1)
+            self.reporter.begin("tracks", total)
+            self.tracks = load_or_track(
+                self.video, self.config.tracking, self.track_cache,
+                lambda done, _: self.reporter.advance(done), self.should_stop,
+            )  # fmt: skip
+            self.reporter.end(f"{self.tracks.num_tracks} tracks")
+            self.report.facts.append(f"tracks: {self.tracks.num_tracks} by the built-in tracker")
+        return self.tracks
+
+
+def static_tracks(tracks: Tracks, masks: FrameSource[Int32Array]) -> BoolArray:
+    """Return (K,) which tracks are never seen on a mask."""
+    static = np.ones(tracks.num_tracks, bool)
+    for frame, mask in enumerate(masks):
+        seen = np.flatnonzero(tracks.visible[:, frame])
+        pixel: FloatArray = np.rint(tracks.uv[seen, frame]).astype(np.int64)
+        x, y = np.clip(pixel[:, 0], 0, mask.shape[1] - 1), np.clip(pixel[:, 1], 0, mask.shape[0] - 1)
+        static[seen[mask[y, x] != 0]] = False
+    return static
+
+
+def _name_of(depths: FrameSource[Float32Array]) -> str:
+    """Return what tells depth that was made from other depth of the same images; given depth is in the video's key."""
+    return depths.paths[0].parent.name if isinstance(depths, FloatMaps) else "given"

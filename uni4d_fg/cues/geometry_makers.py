@@ -1,0 +1,162 @@
+"""Depth and masks that need no network, kept on disk like those that do."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.cache import FloatMaps, FrameCache, image_key, maker_key
+from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
+from uni4d_fg.cues.motion_masks import motion_masks
+from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
+from uni4d_fg.progress import Reporter
+from uni4d_fg.sequence.frames import MaskFolder
+from uni4d_fg.sequence.model import FrameSource, Video
+from uni4d_fg.tracks.model import Tracks
+
+ShouldStop = Callable[[], bool]
+
+_RECORD = "structure"
+
+
+def geometric_depth(
+    video: Video, tracks: Tracks, is_static: BoolArray, intrinsics: FloatArray, images_key: str, folder: Path,
+    config: Config, reporter: Reporter, should_stop: ShouldStop,
+) -> GeometricDepth:  # fmt: skip
+    """Find depth from the motion of the camera, unless it is there already.
+
+    Args:
+        video: Images; its masks, if any, say what moves; its intrinsics, if any, are kept.
+        tracks: K tracks.
+        is_static: (K,) which of them may be believed to stand still.
+        intrinsics: (4,) px, known or to start from.
+        images_key: Key of the images.
+        folder: Of the cues.
+        config: Of all parts.
+        reporter: Progress.
+        should_stop: Polled often.
+
+    Raises:
+        DegenerateProblemError: If the motion does not determine it.
+        OutputError: If it cannot be stored.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    key = maker_key(
+        config.geometric_depth, config.bundle_adjustment, config.input, images_key, _tracks_key(tracks),
+        _digest(is_static), intrinsics.tolist(), masks_key(video),
+    )  # fmt: skip
+    target = folder / "depth" / f"motion-{key}"
+    cache = FrameCache(target)
+    stored = _stored_structure(cache, tracks)
+    if stored is None:
+        result = depth_from_motion(video, tracks, is_static, intrinsics, config, reporter, should_stop)
+        store_maps(iter(result.depths), video.num_frames, video.image_size, target, "depth maps", reporter, should_stop)
+        said = json.dumps([list(result.facts), list(result.warnings)])
+        # Written last: with it, the maps are complete.
+        cache.put_arrays(
+            _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
+            has_parallax=np.array([result.has_parallax]), said=np.array(said),
+        )  # fmt: skip
+        stored = _stored_structure(cache, tracks)
+        assert stored is not None
+    paths = tuple(cache.map_path(f"{frame:06d}") for frame in range(video.num_frames))
+    facts, warnings = json.loads(str(stored["said"]))
+    return GeometricDepth(
+        FloatMaps(paths, video.image_size), stored["world_T_cam"], stored["intrinsics"],
+        stored["sparse"].astype(np.float32), bool(stored["has_parallax"][0]), tuple(facts), tuple(warnings),
+    )  # fmt: skip
+
+
+def _stored_structure(cache: FrameCache, tracks: Tracks) -> dict[str, npt.NDArray[Any]] | None:
+    ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "has_parallax": 1, "said": None}
+    stored = cache.arrays(_RECORD, ranks)
+    return stored if stored is not None and stored["sparse"].shape == tracks.visible.shape else None
+
+
+def moving_masks(
+    video: Video, depths: FrameSource[Float32Array], tracks: Tracks, intrinsics: FloatArray, images_key: str,
+    depth_key: str, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
+) -> tuple[MaskFolder, list[str], list[str]]:  # fmt: skip
+    """Find what moves, unless that is there already.
+
+    Returns:
+        T maps of ids, facts and warnings.
+
+    Raises:
+        DegenerateProblemError: If the tracks do not determine the cameras.
+        OutputError: If a mask cannot be stored.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    key = maker_key(
+        config.motion_masks, config.camera_init, config.bundle_adjustment, config.labels, config.input, images_key,
+        depth_key, _tracks_key(tracks), intrinsics.tolist(),
+    )  # fmt: skip
+    target = folder / "masks" / f"motion-{key}"
+    cache = FrameCache(target)
+    said = cache.arrays("said", {"said": None})
+    if said is not None and labels_are_stored(target, video.num_frames):
+        facts, warnings = json.loads(str(said["said"]))
+        return open_labels(target, video.num_frames, video.image_size), facts, warnings
+    result = motion_masks(video, depths, tracks, intrinsics, config.motion_masks, reporter, should_stop, config)
+    cache.put_arrays("said", said=np.array(json.dumps([result.facts, result.warnings])))
+    masks = store_labels(iter(result.labels), video.num_frames, video.image_size, target, "masks to disk", reporter)
+    return masks, list(result.facts), list(result.warnings)
+
+
+def video_key(video: Video, should_stop: ShouldStop) -> str:
+    """Return a key of all images, and of the depth maps that came with them."""
+    digest = hashlib.blake2b(digest_size=16)
+    for frame, image in enumerate(video.images):
+        if should_stop():
+            break
+        digest.update(image_key(image).encode())
+        if video.depths is not None:
+            digest.update(np.ascontiguousarray(video.depths[frame]).data)
+    return digest.hexdigest()
+
+
+def masks_key(video: Video) -> str:
+    """Return a key of the masks; empty without any."""
+    if video.masks is None:
+        return ""
+    digest = hashlib.blake2b(digest_size=16)
+    for mask in video.masks:
+        digest.update(np.ascontiguousarray(mask).data)
+    return digest.hexdigest()
+
+
+def _tracks_key(tracks: Tracks) -> str:
+    return _digest(np.nan_to_num(tracks.uv), tracks.visible, tracks.query_frame)
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(f"{array.shape} {array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def aligned_depth(
+    disparity: FloatMaps, tracks: Tracks, structure: GeometricDepth, is_static: BoolArray, images_key: str,
+    folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
+) -> tuple[FrameSource[Float32Array], list[str]]:  # fmt: skip
+    """Scale and shift relative disparity to the depth of static tracks.
+
+    Returns:
+        T maps (H, W), in the unit of ``structure``, and facts.
+
+    Raises:
+        InputError: If it cannot be aligned.
+        OutputError: If a map cannot be stored.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    raise NotImplementedError
