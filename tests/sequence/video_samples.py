@@ -21,7 +21,7 @@ def grey_frames(length: int) -> list[np.ndarray]:
 
 def write_video(path: Path, frames: Sequence[np.ndarray], codec: str = "mp4v", backend: int = cv2.CAP_FFMPEG) -> Path:
     """Write RGB frames (H, W, 3) at 12.5 frames a second."""
-    height, width = frames[0].shape[:2]
+    height, width = frames[0].shape[:2] if len(frames) else SIZE
     writer = cv2.VideoWriter(str(path), backend, cv2.VideoWriter_fourcc(*codec), RATE, (width, height))
     assert writer.isOpened()
     for frame in frames:

@@ -17,6 +17,10 @@ from uni4d_fg.sequence.frames import LazyFrames
 from uni4d_fg.sequence.problems import SequenceProblem
 
 _CACHED_FRAMES = 4
+_CACHED_BYTES = 2**27  # when read backwards
+_STEP_BACK = 16  # frames; a longer step back is a jump
+_SEEK_MARGIN = 16  # frames
+_SAME_TIME = 1e-5  # seconds
 _REMEDY = "re-encode the video, or extract its frames into rgb/"
 
 
@@ -24,9 +28,9 @@ class VideoFrames(LazyFrames[ImageArray]):
     """A video file as T images (H, W, 3) uint8 RGB, upright as the file's rotation flag says.
 
     Seeking in compressed video is not frame-exact, so frames are reached by decoding forwards: reading in
-    order costs one decode per frame; going back by more than a few frames starts again from the first. On
-    construction the frames are decoded once, without keeping them, because what a file announces of their
-    number and times is often wrong.
+    order costs one decode per frame. Reading in reverse order decodes a block of frames at a time. On construction
+    the frames are decoded once, without keeping them, because what a file announces of their number and times
+    is often wrong.
 
     Args:
         path: The video file.
@@ -50,6 +54,7 @@ class VideoFrames(LazyFrames[ImageArray]):
         self._cache: OrderedDict[int, ImageArray] = OrderedDict()
         self._capture: Any = cv2.VideoCapture()
         self._next = 0
+        self._last = -1
         self._open()
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self.frame_rate = rate if np.isfinite(rate) and rate > 0 else None
@@ -58,6 +63,7 @@ class VideoFrames(LazyFrames[ImageArray]):
             self._check_complete(0)
             raise SequenceProblem(path, "holds no frame that can be decoded", _REMEDY)
         self.size: tuple[int, int] = (first.shape[0], first.shape[1])
+        self._block = max(_CACHED_FRAMES, _CACHED_BYTES // first.nbytes)
         self._length, self.times = self._look_through(stop)
 
     def _open(self) -> None:
@@ -114,18 +120,42 @@ class VideoFrames(LazyFrames[ImageArray]):
 
     def _read(self, frame: int) -> ImageArray:
         with self._lock:
+            steps_back = 0 < self._last - frame <= _STEP_BACK
+            self._last = frame
             if frame in self._cache:
                 return self._cache[frame].copy()
-            if frame < self._next:
-                self._open()
-            image = self._advance_to(frame)
-            if image is None:
-                self._open()
-                raise SequenceProblem(self.where(frame), "cannot be decoded", _REMEDY)
-            self._cache[frame] = image
-            while len(self._cache) > _CACHED_FRAMES:
+            # Whoever steps back will do so again: the frames before are kept while they are at hand.
+            first = max(frame + 1 - self._block, 0) if steps_back else frame
+            self._rewind(first)
+            while len(self._cache) > (0 if steps_back else _CACHED_FRAMES - 1):
                 self._cache.popitem(last=False)
-            return image.copy()
+            for wanted in range(first, frame + 1):
+                image = self._advance_to(wanted)
+                if image is None:
+                    self._open()
+                    raise SequenceProblem(self.where(wanted), "cannot be decoded", _REMEDY)
+                if image.shape[:2] != self.size:
+                    raise SequenceProblem(self.where(wanted), "has another size than the first frame", _REMEDY)
+                self._cache[wanted] = image
+            return self._cache[frame].copy()
+
+    def _rewind(self, frame: int) -> None:
+        """Make sure that the next decoded frame is not behind ``frame``."""
+        if frame >= self._next:
+            return
+        self._open()
+        if self.times is None or frame <= _SEEK_MARGIN:
+            return
+        # A seek may end anywhere, and what follows it at once may be damaged. The time of the frame that it ends at
+        # tells which one it is; if that is none, or too late, frames are decoded from the first.
+        self._capture.set(cv2.CAP_PROP_POS_MSEC, 1e3 * float(self.times[frame - _SEEK_MARGIN]))
+        if self._capture.grab():
+            time = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+            reached = int(np.abs(self.times - time).argmin())
+            if abs(self.times[reached] - time) < _SAME_TIME and reached <= frame - _SEEK_MARGIN:
+                self._next = reached + 1
+                return
+        self._open()
 
 
 def _quiet_capture(path: Path) -> Any:
