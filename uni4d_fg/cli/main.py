@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from uni4d_fg.cli import comparison, exports, reconstruction, results, sequences, streaming, viewing
+from uni4d_fg.cli import comparison, cues, doctor, exports, reconstruction, results, sequences, streaming, viewing
 from uni4d_fg.cli.console import log_to_stderr, one_line, print_error
 from uni4d_fg.errors import Cancelled, Uni4dFgError
 
@@ -23,7 +23,8 @@ app = typer.Typer(
     epilog="Start with: uni4d-fg demo",
 )
 for verb in (
-    reconstruction.demo, sequences.validate, sequences.track, reconstruction.reconstruct, streaming.stream,
+    reconstruction.demo, doctor.doctor, sequences.validate, sequences.track, cues.cues, reconstruction.reconstruct,
+    streaming.stream,
     results.evaluate, exports.export, viewing.view, viewing.report,
     comparison.compare, sequences.synthesize, results.config,
 ):  # fmt: skip
