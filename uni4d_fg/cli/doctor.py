@@ -62,7 +62,11 @@ def examine() -> dict[str, Any]:
         },
         "open3d": _open3d(),
         "extras": {
-            name: {"installed": find_spec(module) is not None, "for": purpose, "install": f"pip install 'uni4d-fg[{name}]'"}
+            name: {
+                "installed": find_spec(module) is not None,
+                "for": purpose,
+                "install": f"pip install 'uni4d-fg[{name}]'",
+            }
             for name, (module, purpose) in _EXTRAS.items()
         },
         "onnxruntime": _onnxruntime(),

@@ -219,10 +219,11 @@ class _Gathering:
             self.world_T_cam = found.world_T_cam
             return found.depths
         self.motion_warnings = [NOT_METRIC_RELATIVE, *found.warnings]
-        depths, facts = aligned_depth(
-            network.maps, tracks, found, static, self._key(), self.folder, self.config, self.reporter, self.should_stop
+        depths, facts, warnings = aligned_depth(
+            network.maps, tracks, found, self.folder, self.config, self.reporter, self.should_stop
         )
-        self.motion_facts += facts
+        self.motion_facts += [f"depth: {fact}" for fact in facts]
+        self.motion_warnings += warnings
         return depths
 
     def _motion_masks(self, depths: FrameSource[Float32Array]) -> FrameSource[Int32Array]:

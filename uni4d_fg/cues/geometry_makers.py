@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.affine_depth import align_affine
 from uni4d_fg.cues.cache import FloatMaps, FrameCache, image_key, maker_key
 from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.motion_masks import motion_masks
@@ -146,17 +147,30 @@ def _digest(*arrays: np.ndarray) -> str:
 
 
 def aligned_depth(
-    disparity: FloatMaps, tracks: Tracks, structure: GeometricDepth, is_static: BoolArray, images_key: str,
-    folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
-) -> tuple[FrameSource[Float32Array], list[str]]:  # fmt: skip
-    """Scale and shift relative disparity to the depth of static tracks.
+    disparity: FloatMaps, tracks: Tracks, structure: GeometricDepth, folder: Path, config: Config, reporter: Reporter,
+    should_stop: ShouldStop,
+) -> tuple[FloatMaps, list[str], list[str]]:  # fmt: skip
+    """Scale and shift a network's disparity, frame by frame, to the depth of static tracks.
 
     Returns:
-        T maps (H, W), in the unit of ``structure``, and facts.
+        T maps (H, W), in the unit of ``structure``; facts; warnings.
 
     Raises:
-        InputError: If it cannot be aligned.
+        DegenerateProblemError: If no frame has enough points to align to.
         OutputError: If a map cannot be stored.
         Cancelled: If ``should_stop`` turned true.
     """
-    raise NotImplementedError
+    fit = align_affine(
+        disparity, tracks, structure.sparse, config.affine_depth, reporter=reporter, should_stop=should_stop
+    )
+    named = [path.name for path in disparity.paths]
+    key = maker_key(disparity.paths[0].parent.name, named, _digest(fit.scale, fit.shift), config.affine_depth)
+    maps = store_maps(
+        iter(fit.depths), len(named), disparity.size, folder / "depth" / f"aligned-{key}", "depth maps", reporter,
+        should_stop,
+    )  # fmt: skip
+    fact = (
+        f"relative depth aligned to {int(np.median(fit.points))} points per frame (median), "
+        f"noise {100 * fit.sigma:.1f} % of inverse depth"
+    )
+    return maps, [fact], list(fit.warnings)
