@@ -49,7 +49,7 @@ def line_chart(
         y_low, y_high = _widen(*(math.log10(v) for v in (ys.min() / 1.1, ys.max() * 1.1)))
         ticks = [(math.log10(value), value) for value in _log_ticks(10**y_low, 10**y_high)]
     else:
-        y_low, y_high = _widen(min(0.0, float(ys.min())), 1.05 * float(ys.max()))
+        y_low, y_high = _widen(1.05 * min(0.0, float(ys.min())), 1.05 * max(0.0, float(ys.max())))
         ticks = [(value, value) for value in nice_ticks(y_low, y_high)]
 
     def at_x(value: float) -> float:

@@ -53,8 +53,8 @@ class Viewer:
         times = np.diff(reconstruction.timestamps)
         rate = 1.0 / float(np.median(times)) if len(times) else 1.0
         # Sequences without times count frames; they play at an ordinary rate.
-        self._panel = Panel(server, run.num_frames, run.name, rate if rate > 1.5 else 15.0, self._shown)
-        self._panel.notes.content = _notes(run, source, limits)
+        self.panel = Panel(server, run.num_frames, run.name, rate if rate > 1.5 else 15.0, self._shown)
+        self.panel.notes.content = _notes(run, source, limits)
         self._prepare_scene()
         self._attach()
 
@@ -79,7 +79,7 @@ class Viewer:
         return first + self._depth * (0.3 * right - 0.5 * forward + 0.35 * up), target
 
     def _attach(self) -> None:
-        panel = self._panel
+        panel = self.panel
         for control in (
             panel.static, panel.landmarks, panel.moving, panel.trajectories, panel.cameras, panel.images,
             panel.history, panel.tail, panel.point_size, panel.color, panel.frame,
@@ -92,7 +92,7 @@ class Viewer:
     def refresh(self) -> None:
         """Draw what the panel asks for now."""
         with self._lock:
-            shown, by = self._panel.shown(), self._panel.color_by
+            shown, by = self.panel.shown(), self.panel.color_by
             before, self._shown = self._shown, shown
             recolored = by is not self._coloring.by
             if shown == before and not recolored:
@@ -113,13 +113,13 @@ class Viewer:
             # Only landmarks have numbers of their own.
             shown = Shown(**{**vars(shown), "landmarks": True})
         self._points.draw_still(self._coloring, shown)
-        self._panel.legend.content = self._coloring.legend()
+        self.panel.legend.content = self._coloring.legend()
 
     def _draw_frame(self) -> None:
         self._points.draw_frame(self._coloring, self._shown)
         self._trajectories.draw(self._coloring, self._shown)
         self._cameras.draw_frame(self._shown)
-        self._panel.facts.content = self._facts(self._shown.frame)
+        self.panel.facts.content = self._facts(self._shown.frame)
 
     def _facts(self, frame: int) -> str:
         reconstruction, values = self._run.reconstruction, self._values
@@ -139,7 +139,7 @@ class Viewer:
         height, width = reconstruction.image_size
         fov = vertical_fov(reconstruction)
         # The frusta would stand in the way of the view that is asked for.
-        self._panel.cameras.value = False
+        self.panel.cameras.value = False
         for client in clients:
             aspect = client.camera.aspect
             narrow = aspect > 0 and aspect < width / height
@@ -150,12 +150,12 @@ class Viewer:
                 client.camera.fov = float(fitted)
 
     def _follow_if_asked(self) -> None:
-        if self._panel.follow.value:
+        if self.panel.follow.value:
             self._look_through(list(self._server.get_clients().values()))
 
     def _show_overview(self, client: Any) -> None:
-        self._panel.follow.value = False
-        self._panel.cameras.value = True
+        self.panel.follow.value = False
+        self.panel.cameras.value = True
         position, target = self._overview
         with client.atomic():
             client.camera.up_direction = upright_axes(self._run.reconstruction.world_T_cam)[2]
@@ -167,12 +167,12 @@ class Viewer:
         """Play when asked to, until ``should_stop``."""
         due = time.monotonic()
         while not should_stop():
-            if not self._panel.play.value or self._run.num_frames < 2:
+            if not self.panel.play.value or self._run.num_frames < 2:
                 time.sleep(_IDLE_SECONDS)
                 due = time.monotonic()
                 continue
-            due += 1.0 / float(self._panel.frames_per_second.value)
-            self._panel.frame.value = (int(self._panel.frame.value) + 1) % self._run.num_frames
+            due += 1.0 / float(self.panel.frames_per_second.value)
+            self.panel.frame.value = (int(self.panel.frame.value) + 1) % self._run.num_frames
             self.refresh()
             # Drawing may take longer than a frame lasts; the rate then drops instead of a queue growing.
             due = max(due, time.monotonic())
