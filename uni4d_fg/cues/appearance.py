@@ -29,6 +29,7 @@ _SURROUNDING_PX = 15
 _PREDICTION_SIGMA_PX = 1.0
 _MEDIAN_OF_SQUARE = 0.455
 _LIMITS = (-1.0, 3.0)
+_SAMPLE = 4
 
 
 @dataclass(frozen=True)
@@ -90,11 +91,12 @@ def moved_evidence(
     static = predict_static(columns, rows, source.depth.log_depth, target_T_source, intrinsics)
     u, v = (static.u + shared[0]).astype(np.float32), (static.v + shared[1]).astype(np.float32)
     inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
-    if not inside.any():
-        return np.zeros((height, width), np.float32)
     seen = cv2.remap(target.colour, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = source.colour - seen
-    difference -= np.median(difference[inside], axis=0)  # exposure
+    some = inside[::_SAMPLE, ::_SAMPLE]
+    if not some.any():
+        return np.zeros((height, width), np.float32)
+    difference -= np.median(difference[::_SAMPLE, ::_SAMPLE][some], axis=0)  # exposure
     squared = cv2.boxFilter((difference * difference).sum(axis=2), -1, (_WINDOW_PX, _WINDOW_PX))
 
     sigma_depth = config.depth_sigma + 0.5 * source.depth.spread
@@ -103,7 +105,7 @@ def moved_evidence(
     variance = 3 * config.intensity_sigma**2 + _PREDICTION_SIGMA_PX**2 * (gxx + gyy)
     variance += du * du * gxx + 2 * du * dv * gxy + dv * dv * gyy
     # Blur and noise of this pair of frames: most of the image is static.
-    variance *= max(1.0, float(np.median(squared[inside] / variance[inside])) / _MEDIAN_OF_SQUARE)
+    variance *= max(1.0, float(np.median((squared / variance)[::_SAMPLE, ::_SAMPLE][some])) / _MEDIAN_OF_SQUARE)
     wider = variance + 2 * source.contrast
     evidence = 0.5 * (squared / variance - squared / wider - np.log(wider / variance))
 

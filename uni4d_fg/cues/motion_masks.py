@@ -180,7 +180,7 @@ class _Comparison:
         self.intrinsics = np.array([fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5])
         self.images: dict[int, ImageArray] = {}
         self.frames: dict[int, FrameAppearance] = {}
-        self.flow = DenseFlow()
+        self.flow = DenseFlow(fine=False)
 
     def detections(self, stop: Callable[[], bool]) -> Iterator[FrameDetections]:
         """Yield the regions that move, frame by frame."""
