@@ -112,10 +112,10 @@ class DepthNetwork:
                 raise self.network.misfit(name, output.shape, "one map (1, H, W); name its channel otherwise")
             return squeezed
         if values.ndim == 4 and values.shape[0] == 1:
-            if channel < values.shape[1] <= 16:
-                return np.asarray(values[0, channel])
-            if channel < values.shape[3] <= 16:
-                return np.asarray(values[0, :, :, channel])
+            # There are fewer channels than columns.
+            channels = values[0] if values.shape[1] <= values.shape[3] else values[0].transpose(2, 0, 1)
+            if channel < len(channels):
+                return np.asarray(channels[channel])
         raise self.network.misfit(name, output.shape, f"(1, C, H, W) or (1, H, W, C) with a channel {channel}")
 
     def _intrinsics(self, outputs: dict[str, npt.NDArray[Any]], placement: Placement) -> FloatArray | None:
