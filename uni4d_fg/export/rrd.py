@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array
-from uni4d_fg.errors import OutputError
 from uni4d_fg.export.clouds import moving_cloud, static_cloud
 from uni4d_fg.export.frames import encode
 from uni4d_fg.export.model import ExportJob
@@ -42,19 +41,16 @@ def write_rrd(job: ExportJob) -> None:
     rerun = import_rerun()
     path = job.folder / "scene.rrd"
     recording = rerun.RecordingStream("uni4d_fg")
-    try:
-        recording.save(str(path), default_blueprint=_blueprint())
-        recording.send_recording_name(job.source.sequence.name)
-        _log_static(rerun, recording, job)
-        written = _log_frames(rerun, recording, job)
-        recording.flush()
-    except RuntimeError as error:  # rerun writes in a thread of its own, which has no other way to tell
-        raise OutputError(f"cannot write {path}: {error}; free space or choose another --out") from error
-    finally:
-        recording.disconnect()
-    if not path.exists() or path.stat().st_size < written:
-        raise OutputError(f"cannot write {path}: it is cut short; free space or choose another --out")
-    job.facts.append(f"scene.rrd, {path.stat().st_size / 1e6:.0f} MB: open it with `rerun {path.name}`")
+    # Encoded in memory and written from here: when the disk is full, rerun's own writer may wait for ever.
+    stream = recording.binary_stream()
+    recording.send_blueprint(_blueprint())
+    recording.send_recording_name(job.source.sequence.name)
+    _log_static(rerun, recording, job)
+    _log_frames(rerun, recording, job)
+    data = stream.read()
+    recording.disconnect()
+    path.write_bytes(data)
+    job.facts.append(f"scene.rrd, {len(data) / 1e6:.0f} MB: open it with `rerun {path.name}`")
 
 
 def _blueprint() -> Any:
@@ -83,10 +79,10 @@ def _log_static(rerun: Any, recording: Any, job: ExportJob) -> None:
     job.figures["static_points"] = len(cloud.points)
 
 
-def _log_frames(rerun: Any, recording: Any, job: ExportJob) -> int:
-    """Log what changes with time. Returns a lower bound of the bytes it takes: the JPEGs, which do not compress."""
+def _log_frames(rerun: Any, recording: Any, job: ExportJob) -> None:
+    """Log what changes with time."""
     source, result = job.source, job.source.reconstruction
-    written = moving = 0
+    moving = 0
     palette = instance_colors(result.dynamic_instance)
     for frame in range(source.num_frames):
         recording.set_time("frame", sequence=frame)
@@ -99,13 +95,12 @@ def _log_frames(rerun: Any, recording: Any, job: ExportJob) -> int:
         recording.log("world/dynamic", _points(rerun, cloud.points, cloud.colors))
         strips, row = tails(result, frame, job.options.tail)
         recording.log("world/trajectories", rerun.LineStrips3D(strips, colors=palette[row]))
-        written, moving = written + len(jpeg), moving + len(cloud.points)
+        moving += len(cloud.points)
         job.advance(frame + 1)
     job.figures |= {"frames": source.num_frames, "dynamic_points": moving}
     job.facts.append(
         f"{source.num_frames} frames with images, {moving} moving points, {len(result.dynamic_track)} trajectories"
     )
-    return written
 
 
 def tails(result: Reconstruction, frame: int, length: int) -> tuple[list[Float32Array], Int32Array]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from uni4d_fg.errors import OutputError
@@ -74,14 +74,11 @@ def _export(
     should_stop: Callable[[], bool],
 ) -> ExportReport:
     reporter.begin(name, source.num_frames)
-    # Written beside its place, so that an earlier export stays until the new one is whole.
-    fresh = temporary_sibling(target)
-    with atomic_folder(fresh) as folder:
+    with _replaced_folder(target) as folder:
         job = ExportJob(source, folder, options, reporter, should_stop)
         exporter(name).write(job)
         facts = {"format": name, "run": str(source.folder.root.resolve()), "figures": job.figures, "facts": job.facts}
         atomic_write_json(folder / MARKER, facts)
-    _replace(fresh, target)
     reporter.end()
     return ExportReport(name, target, tuple(job.facts), job.figures, tuple(job.warnings))
 
@@ -103,7 +100,28 @@ def _is_export(target: Path) -> bool:
         return False
 
 
-def _replace(fresh: Path, target: Path) -> None:
+@contextmanager
+def _replaced_folder(target: Path) -> Iterator[Path]:
+    """Like :func:`atomic_folder`, but a folder that is there already stays until the new one is whole, and then goes.
+
+    Raises:
+        OutputError: If an ``OSError`` occurs in the block or while moving.
+    """
+    fresh = temporary_sibling(target)
+    try:
+        with atomic_folder(fresh) as folder:
+            try:
+                yield folder
+            except OutputError as error:
+                raise OutputError(str(error).replace(str(folder), str(target))) from error
+            except OSError as error:
+                raise write_failure(target, error) from error
+        _move(fresh, target)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _move(fresh: Path, target: Path) -> None:
     """Move a finished folder to its place; what is there goes, or comes back if that fails."""
     old = temporary_sibling(target)
     try:
@@ -114,6 +132,5 @@ def _replace(fresh: Path, target: Path) -> None:
         if old.exists():
             with suppress(OSError):
                 os.replace(old, target)
-        shutil.rmtree(fresh, ignore_errors=True)
         raise write_failure(target, error) from error
     shutil.rmtree(old, ignore_errors=True)
