@@ -9,8 +9,10 @@ from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
 from uni4d_fg.config.geometric_depth import AffineDepthConfig, GeometricDepthConfig
 from uni4d_fg.config.incremental import IncrementalConfig
+from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
+from uni4d_fg.config.windows import WindowsConfig
 
 
 class OutputConfig(Section):
@@ -50,9 +52,11 @@ class Config(Section):
     bundle_adjustment: BundleAdjustmentConfig = setting(BundleAdjustmentConfig(), "Stage 2.")
     nonrigid: NonRigidConfig = setting(NonRigidConfig(), "Stage 3.")
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
+    windows: WindowsConfig = setting(WindowsConfig(), "Reconstruction in windows.")
     incremental: IncrementalConfig = setting(IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.")
     fusion: FusionConfig = setting(FusionConfig(), "Fusion.")
     networks: NetworkConfig = setting(NetworkConfig(), "Networks that make cues.")
     geometric_depth: GeometricDepthConfig = setting(GeometricDepthConfig(), "Depth from camera motion alone.")
     affine_depth: AffineDepthConfig = setting(AffineDepthConfig(), "Scale and shift of relative depth networks.")
+    motion_masks: MotionMaskConfig = setting(MotionMaskConfig(), "Masks from motion alone, and instances over time.")
     output: OutputConfig = setting(OutputConfig(), "Output.")

@@ -90,3 +90,12 @@ def orthonormalize(transform: FloatArray) -> FloatArray:
     out = transform.copy()
     out[..., :3, :3] = u @ vt
     return out
+
+
+def adjoint(transform: FloatArray) -> FloatArray:
+    """Return Ad (6, 6) of a rigid transform: ``T Exp(xi) = Exp(Ad xi) T``, rotation first."""
+    out = np.zeros((6, 6))
+    rotation, centre = transform[:3, :3], transform[:3, 3]
+    out[:3, :3] = out[3:, 3:] = rotation
+    out[3:, :3] = skew(centre) @ rotation
+    return out

@@ -101,17 +101,8 @@ def locate(
     return FramePose(state["pose"][0], float(state["log_scale"][0, 0]), inlier, covariance)
 
 
-def adjoint(transform: FloatArray) -> FloatArray:
-    """Return Ad (6, 6) of a rigid transform: ``T Exp(xi) = Exp(Ad xi) T``, rotation first."""
-    out = np.zeros((6, 6))
-    rotation, centre = transform[:3, :3], transform[:3, 3]
-    out[:3, :3] = out[3:, 3:] = rotation
-    out[3:, :3] = se3.skew(centre) @ rotation
-    return out
-
-
 def composed_covariance(reference: FloatArray, reference_T_cam: FloatArray, relative: FloatArray) -> FloatArray:
     """Return the covariance of ``world_T_reference reference_T_cam`` from those of its two parts, (6, 6) each."""
-    back = adjoint(se3.inverse(reference_T_cam))
+    back = se3.adjoint(se3.inverse(reference_T_cam))
     result: FloatArray = back @ reference @ back.T + relative
     return result

@@ -12,7 +12,7 @@ import numpy as np
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.sequence.model import Sequence
 
-ALGORITHM_VERSION = 1
+ALGORITHM_VERSION = 2
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""
 
 

@@ -125,32 +125,36 @@ def _bundle_arrays(result: BundleAdjustmentResult) -> dict[str, npt.NDArray[Any]
 
 
 def _bundle_summary(sequence: Sequence, result: BundleAdjustmentResult, config: Config) -> dict[str, Any]:
-    fx, fy = result.intrinsics[:2]
+    solves = [solve_dict(s) for s in result.solves]
+    summary = bundle_summary(sequence, _bundle_arrays(result), len(result.observations), result.dropped, solves)
+    summary["exact_energy"] = static_energy(
+        result.world_T_cam, result.intrinsics, result.landmarks, result.observations, config.normalization
+    )
+    return summary
+
+
+def bundle_summary(
+    sequence: Sequence, arrays: Arrays, num_observations: int, dropped: dict[str, int], solves: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Return what ``summary.json`` says of stage 2, from its record's arrays."""
+    (fx, fy), landmarks, first = arrays["intrinsics"][:2], arrays["landmarks"], arrays["world_T_cam"][0, :3, 3]
+    pixel, relative = arrays["noise"]
     facts = [
-        f"{len(result.landmarks)} landmarks, {len(result.observations)} observations, "
-        f"fx {fx:.1f} fy {fy:.1f} px, noise {result.noise.reprojection_sigma_px:.2f} px, "
-        f"depth {100 * result.noise.depth_sigma:.1f} %"
+        f"{len(landmarks)} landmarks, {num_observations} observations, "
+        f"fx {fx:.1f} fy {fy:.1f} px, noise {pixel:.2f} px, depth {100 * relative:.1f} %"
     ]
     warnings = []
-    change = float(np.abs(result.intrinsics[:2] / sequence.intrinsics[:2] - 1.0).max())
+    change = float(np.abs(arrays["intrinsics"][:2] / sequence.intrinsics[:2] - 1.0).max())
     if change > 0.15:
         warnings.append(f"the focal lengths moved by {100 * change:.0f} % from the given ones")
-    baseline = np.linalg.norm(result.world_T_cam[:, :3, 3] - result.world_T_cam[0, :3, 3], axis=1).max()
-    depth = float(np.median(np.linalg.norm(result.landmarks - result.world_T_cam[0, :3, 3], axis=1)))
+    baseline = np.linalg.norm(arrays["world_T_cam"][:, :3, 3] - first, axis=1).max()
+    depth = float(np.median(np.linalg.norm(landmarks - first, axis=1)))
     if baseline < 0.01 * depth:
         warnings.append(
             f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
             "depth comes from the cue alone, and the focal length is poorly determined"
         )
-    return {
-        "solves": [solve_dict(s) for s in result.solves],
-        "dropped": result.dropped,
-        "facts": facts,
-        "warnings": warnings,
-        "exact_energy": static_energy(
-            result.world_T_cam, result.intrinsics, result.landmarks, result.observations, config.normalization
-        ),
-    }
+    return {"solves": solves, "dropped": dropped, "facts": facts, "warnings": warnings}
 
 
 def _without_landmarks(cameras: Arrays, config: Config, reason: str) -> StageRecord:

@@ -21,8 +21,8 @@ from uni4d_fg.factors.priors import LOG_SCALE_PRIOR, SCALE_ANCHOR
 from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 from uni4d_fg.graph.state import State, VariableNames
-from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.clustered import Clusters, Spread, clustered_marginals, image_cells
+from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.marginals import CameraMarginals, camera_marginals
 from uni4d_fg.solve.summary import SolveSummary, Termination
 from uni4d_fg.stages.lifting import lift, mean_per_row
@@ -258,7 +258,8 @@ def adjust_bundle(
         if summary.termination is Termination.CANCELLED:
             break
         if config.depth_prior and freedom.poses:
-            state = _hold_metric_scale(state)
+            scaled = hold_metric_scale(state["pose"], state["log_scale"][:, 0], state["landmark"])
+            state = state.replace(pose=scaled[0], log_scale=scaled[1][:, None], landmark=scaled[2])
         if index == rounds - 1 and not unsquared:
             pose_covariance, intrinsics_covariance = _covariances(stage, state, observations, config)
         state, observations = drop_outliers(state, observations, config, dropped)
@@ -282,7 +283,7 @@ def adjust_bundle(
         landmarks = np.where(np.isfinite(relifted), relifted, landmarks)
     track = state.names.landmark_track
     assert track is not None
-    keep = _spatial_inliers(landmarks, config)
+    keep = spatial_inliers(landmarks, config)
     dropped["landmark far from its neighbours"] = int((~keep).sum())
     if not keep.any():
         raise DegenerateProblemError(
@@ -312,9 +313,7 @@ def _covariances(
     return marginals.blocks("pose", len(state["pose"])), marginals.blocks("intrinsics", 1)[0]
 
 
-def track_cells(
-    observations: Observations, intrinsics: FloatArray, config: BundleAdjustmentConfig
-) -> Clusters | None:
+def track_cells(observations: Observations, intrinsics: FloatArray, config: BundleAdjustmentConfig) -> Clusters | None:
     """Put tracks, in ascending order, into clusters by the image cell of their first observation; None if off."""
     if config.covariance_cells == 0:
         return None
@@ -333,19 +332,20 @@ def static_marginals(
     return clustered_marginals(stage.problem, state, stage.solver, clusters, stage.eliminate, carried)
 
 
-def _hold_metric_scale(state: State) -> State:
-    """Scale the world about frame 0's centre so that the frames' log-scales have zero mean.
+def hold_metric_scale(
+    world_T_cam: FloatArray, log_scale: FloatArray, landmarks: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Scale the world about frame 0's centre so that the frames' log-scales (T,) have zero mean.
 
     Reprojection does not see the scale of the world, and the widened depth prior holds it weakly: the cue's
     mean over all frames is the best metric scale there is.
     """
-    shift = float(np.mean(state["log_scale"]))
+    shift = float(np.mean(log_scale))
     factor = np.exp(-shift)
-    poses = state["pose"].copy()
+    poses = world_T_cam.copy()
     centre = poses[0, :3, 3].copy()
     poses[:, :3, 3] = centre + factor * (poses[:, :3, 3] - centre)
-    landmarks = centre + factor * (state["landmark"] - centre)
-    return state.replace(pose=poses, landmark=landmarks, log_scale=state["log_scale"] - shift)
+    return poses, log_scale - shift, centre + factor * (landmarks - centre)
 
 
 def reprojection_residual(state: State, observations: Observations, row: IntArray) -> FloatArray:
@@ -447,7 +447,7 @@ def measure_noise(
     )
 
 
-def _spatial_inliers(landmarks: FloatArray, config: BundleAdjustmentConfig) -> BoolArray:
+def spatial_inliers(landmarks: FloatArray, config: BundleAdjustmentConfig) -> BoolArray:
     """Return which landmarks are not isolated: mean squared distance to 5 neighbours below the quantile rule."""
     if len(landmarks) < 7:
         return np.ones(len(landmarks), dtype=bool)

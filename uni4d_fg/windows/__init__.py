@@ -1,0 +1,1 @@
+"""Batch reconstruction in overlapping windows that are joined by the cameras they share."""
