@@ -81,6 +81,13 @@ Overrides = Annotated[
 ]
 Solver = Annotated[SolverChoice | None, typer.Option(help="Minimiser; short for --set solver=...", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+WindowFrames = Annotated[
+    int | None,
+    typer.Option("--window", help="Solve in windows of this many frames, for a video too long for one graph.", min=6),
+]
+WindowOverlap = Annotated[
+    int | None, typer.Option("--overlap", help="Frames that a window shares with the next.", min=2)
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a run; finished stages are kept.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]

@@ -29,6 +29,8 @@ def reconstruct(
     config: options.ConfigChoice = None,
     changes: options.Overrides = None,
     solver: options.Solver = None,
+    window: options.WindowFrames = None,
+    overlap: options.WindowOverlap = None,
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     start: options.Start = 0,
@@ -57,6 +59,8 @@ def reconstruct(
     from uni4d_fg.config.load import load_config
 
     chosen = [] if solver is None else [f"solver={solver.value}"]
+    chosen += [] if window is None else [f"windows.frames={window}"]
+    chosen += [] if overlap is None else [f"windows.overlap={overlap}"]
     settings = load_config(config, [*(changes or ()), *chosen])
     source = SequenceInput.of(
         seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics,
