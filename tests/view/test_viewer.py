@@ -104,7 +104,7 @@ def test_it_serves_this_machine_only_and_ctrl_c_ends_it_with_0(finished_run: Pat
         assert process.stdout.readline() == f"room: http://127.0.0.1:{port} (Ctrl-C ends)\n"
         assert urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).status == 200
         process.send_signal(signal.SIGINT)
-        out, error = process.communicate(timeout=20)
+        out, error = process.communicate(timeout=60)
     finally:
         process.kill()
     assert (process.returncode, out, error) == (0, "", "")

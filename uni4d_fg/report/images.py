@@ -11,6 +11,7 @@ from uni4d_fg.view.colors import value_colors
 from uni4d_fg.view.content import thumbnail
 
 _MISSING = (150, 155, 162)
+_MIN_MAP_WIDTH = 480
 
 
 def depth_bounds(maps: list[Float32Array]) -> tuple[float, float]:
@@ -60,9 +61,13 @@ def residual_picture(
         is_dynamic: (N,).
         unused_uv: (U, 2) pixels of tracks without a point.
         bounds: Residuals at the ends of the colours, px.
-        width: Width of the result, px.
+        width: Largest width of the result, px; small images are enlarged.
     """
     small = thumbnail(image, width)
+    if small.shape[1] < _MIN_MAP_WIDTH:
+        # Marks have a size of their own, which would cover a small image.
+        height = round(small.shape[0] * _MIN_MAP_WIDTH / small.shape[1])
+        small = np.asarray(cv2.resize(small, (_MIN_MAP_WIDTH, height), interpolation=cv2.INTER_LINEAR))
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     canvas = np.repeat((0.55 * grey).astype(np.uint8)[..., None], 3, axis=2)
     scale = small.shape[1] / image.shape[1]
