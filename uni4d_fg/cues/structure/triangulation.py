@@ -176,8 +176,9 @@ def _residual(rays: RayBundle, position: FloatArray) -> FloatArray:
 
 
 def _sum_rows(values: FloatArray, row: IntArray, count: int) -> FloatArray:
-    out = np.zeros((count, *values.shape[1:]))
-    flat = values.reshape(len(values), -1)
-    for column in range(flat.shape[1]):
-        out.reshape(count, -1)[:, column] = np.bincount(row, flat[:, column], count)
-    return out
+    columns = int(np.prod(values.shape[1:]))
+    flat = values.reshape(len(values), columns)
+    out = np.zeros((count, columns))
+    for column in range(columns):
+        out[:, column] = np.bincount(row, flat[:, column], count)
+    return out.reshape(count, *values.shape[1:])
