@@ -111,7 +111,7 @@ class FrameCache:
 
     def put_detections(self, key: str, found: FrameDetections) -> None:
         """Write the detections of a frame. Raises OutputError."""
-        bits = np.packbits(found.masks.reshape(len(found), -1), axis=1)
+        bits = np.packbits(found.masks.reshape(len(found), found.masks.shape[1] * found.masks.shape[2]), axis=1)
         save_npz(self.folder / f"{key}.npz", bits=bits, class_ids=found.class_ids, scores=found.scores)
 
     def arrays(self, name: str, ranks: dict[str, int | None]) -> dict[str, npt.NDArray[Any]] | None:
