@@ -15,6 +15,7 @@ from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.geometry import se3
 from uni4d_fg.incremental.dynamic import DynamicWindow, in_world, moving_scales
 from uni4d_fg.incremental.labels import LabelledFrame, TrackBook
+from uni4d_fg.incremental.memory import return_free_memory
 from uni4d_fg.incremental.model import DynamicPoints, FinishedFrame, FrameStatus, FrameTracks, FrameUpdate, Landmarks
 from uni4d_fg.incremental.pose import FramePose, composed_covariance, locate, predict
 from uni4d_fg.incremental.results import Results, ResultsInMemory, assemble_results
@@ -24,6 +25,9 @@ from uni4d_fg.reconstruction.model import Reconstruction
 from uni4d_fg.solve.backend import choose_backend
 from uni4d_fg.stages.bundle_adjustment import StaticNoise
 from uni4d_fg.stages.stage import LevenbergMarquardtRunner
+
+_TRIM_INTERVAL = 5
+"""Frames after which freed memory is given back."""
 
 
 @dataclass
@@ -154,6 +158,8 @@ class IncrementalReconstructor:
         finished = tuple(f for keyframe in left for f in self._finish_keyframe(*keyframe))
         self._forget(frame)
         self.results.add(finished, tuple(landmarks))
+        if frame % _TRIM_INTERVAL == 0:
+            return_free_memory()
         return self._update(status, dynamic, used, finished, tuple(landmarks))
 
     def finish(self) -> Reconstruction:

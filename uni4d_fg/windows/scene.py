@@ -246,9 +246,6 @@ def place(scene: WindowScene, cameras: Cameras, config: BundleAdjustmentConfig, 
 def owned(scene: WindowScene, spans: TrackSpans, windows: list[Window], index: int) -> WindowScene:
     """Keep the observations that a window owns, and the landmarks that these determine.
 
-    The depth errors of a track are alike in all windows that it passes through: each of them may only count its
-    share of what the whole track says, at the sigma that the whole track has.
-
     Args:
         scene: A window's scene.
         spans: Of every track of the video.
@@ -261,11 +258,7 @@ def owned(scene: WindowScene, spans: TrackSpans, windows: list[Window], index: i
     frame = seen.frame + scene.window.start
     kept = seen.select((frame >= lower[seen.track]) & (frame < upper[seen.track])).with_min_observations(2)
     rows, row = kept.rows()
-    whole = float(np.mean(spans.count[track[rows]])) if len(rows) else 1.0
-    noise = replace(scene.noise, depth_sigma=scene.noise.effective_depth_sigma(whole), depth_correlation=0.0)
-    return replace(
-        scene, landmark=scene.landmark[rows], track=track[rows], observations=replace(kept, track=row), noise=noise
-    )
+    return replace(scene, landmark=scene.landmark[rows], track=track[rows], observations=replace(kept, track=row))
 
 
 def information(scene: WindowScene, windows: list[Window], index: int, config: Config) -> WindowInformation:
