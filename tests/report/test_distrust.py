@@ -69,6 +69,21 @@ def test_uncertain_cameras_are_named(run: OpenedRun) -> None:
     assert found[1].endswith("in frame 6.")
 
 
+def test_an_uncertain_focal_length_is_named(run: OpenedRun) -> None:
+    focal = run.reconstruction.intrinsics[0]
+    covariance = np.diag([(0.2 * focal) ** 2, 0.0, 0.0, 0.0])
+    reconstruction = replace(run.reconstruction, intrinsics_covariance=covariance)
+    assert distrusted(replace(run, reconstruction=reconstruction), None) == [
+        "The focal length is uncertain by 20 % (standard deviation)."
+    ]
+
+
+def test_that_depth_is_not_metric_is_said_once_and_first(run: OpenedRun) -> None:
+    cues = {"metric": False, "warnings": ["masks are a guess", "depth is not metric: no depth was given"]}
+    found = distrusted(replace(run, summary={**run.summary, "cues": cues}), None)
+    assert found == ["Depth is not metric: no depth was given.", "Masks are a guess."]
+
+
 def test_dropped_shares_and_scales_are_judged(run: OpenedRun) -> None:
     found = distrusted(with_stage(run, "tracks", tracks={"static": 10, "rejected": 30}), None)
     assert found[0].startswith("30 of 40 tracks were rejected")

@@ -14,6 +14,7 @@ from uni4d_fg.view.residuals import Residuals, pose_sigmas
 _MIN_STATIC_PER_FRAME = 30
 _OUTLYING_FRAME = 3.0
 _LARGE_POSITION_SIGMA = 0.02
+_LARGE_FOCAL_SIGMA = 0.03
 _LARGE_SCALE_SPREAD = 0.15
 _LARGE_DROPPED_SHARE = 0.1
 _UNFINISHED_DECREASE = 1e-4
@@ -21,19 +22,20 @@ _UNFINISHED_DECREASE = 1e-4
 
 def distrusted(run: OpenedRun, residuals: Residuals | None) -> list[str]:
     """Return one sentence for everything that a reader should know before using the result."""
-    found = [*_own_warnings(run), *_solvers(run.summary), *_geometry(run)]
+    found = [*_own_warnings(run), *_dropped(run), *_geometry(run)]
     if residuals is not None:
         found += _frames(run, residuals)
-    found += _dropped(run)
+    found += _solvers(run.summary)
     return list(dict.fromkeys(found))
 
 
 def _own_warnings(run: OpenedRun) -> Iterator[str]:
     cues = run.summary.get("cues")
-    if not run.is_metric:
+    warnings = list(map(_sentence, cues.get("warnings", []))) if isinstance(cues, dict) else []
+    if not run.is_metric and not any("not metric" in text for text in warnings):
         yield "Depth is not metric: all lengths are up to one unknown scale, also where a number looks like metres."
-    if isinstance(cues, dict):
-        yield from map(_sentence, cues.get("warnings", []))
+    # That lengths have no unit concerns every number below it.
+    yield from sorted(warnings, key=lambda text: "not metric" not in text)
     yield from map(_sentence, run.summary.get("warnings", []))
 
 
@@ -82,6 +84,13 @@ def _geometry(run: OpenedRun) -> Iterator[str]:
         )
     if not len(reconstruction.landmarks):
         yield "There is no static landmark: nothing but the input supports the cameras."
+    covariance = reconstruction.intrinsics_covariance
+    if covariance is not None:
+        relative = np.sqrt(np.diagonal(covariance)[:2]) / reconstruction.intrinsics[:2]
+        if not np.isfinite(relative).all():
+            yield "The data do not determine the focal length."
+        elif relative.max() > _LARGE_FOCAL_SIGMA:
+            yield f"The focal length is uncertain by {100 * relative.max():.0f} % (standard deviation)."
     sigmas = pose_sigmas(reconstruction)
     if sigmas is None:
         return
