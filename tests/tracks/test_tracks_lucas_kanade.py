@@ -17,7 +17,9 @@ from uni4d_fg.sequence.model import ArrayFrames
 from uni4d_fg.tracks.lucas_kanade import query_grid, track_grid
 
 HEIGHT, WIDTH = 120, 160
-COARSE = TrackingConfig(grid_columns=14, grid_rows=11, query_interval=4, margin_px=10, max_drift_px=2.0)
+COARSE = TrackingConfig(
+    grid_columns=14, grid_rows=11, query_interval=4, margin_px=10, max_drift_px=2.0, reseed_spacing=None
+)
 
 Motion = Callable[[FloatArray, int], FloatArray]
 """Position (N, 2) in frame 0 and a frame -> position (N, 2) in that frame."""

@@ -13,6 +13,15 @@ class TrackingConfig(Section):
     grid_columns: int = setting(50, "Query points per row of the grid.", ge=2, le=400)
     grid_rows: int = setting(50, "Query points per column of the grid.", ge=2, le=400)
     query_interval: int = setting(10, "A new grid is started every this many frames.", ge=1)
+    reseed_spacing: float | None = setting(
+        1.25,
+        "Side of the cells, in spacings of the grid, in which a point is started in any frame between two grids that "
+        "leaves them without a live one; null: points start on the grids only.",
+        ge=1,
+    )
+    reseed_quality: float = setting(
+        0.03, "Texture that such a point needs, as a fraction of the best in the image.", ge=0, lt=1
+    )
     margin_px: float = setting(8.0, "Distance of the outermost query points from the image border, px.", ge=0)
     window_px: int = setting(21, "Side of the Lucas-Kanade window, px.", ge=5, le=101)
     pyramid_levels: int = setting(3, "Pyramid levels above the full image.", ge=0, le=8)

@@ -15,7 +15,7 @@ from uni4d_fg.tracks.io import load_tracks, save_tracks
 from uni4d_fg.tracks.lucas_kanade import Progress, ShouldStop, track_grid
 from uni4d_fg.tracks.model import Tracks
 
-TRACKER_VERSION = 1
+TRACKER_VERSION = 2
 """Part of the cache key; raised whenever the tracker gives other tracks for the same input."""
 
 

@@ -4,9 +4,11 @@ A grid of query points is started in frames 0, ``query_interval``, 2 ``query_int
 the video follow them: one forwards, in which every grid joins as the sweep passes its frame, and one
 backwards. A step moves all live points of all grids at once, so that a sweep costs two optical-flow calls
 per pair of frames, however many grids there are, plus a short one per live grid for the drift check. Only
-the two images of the step and the grey query images of live grids are held.
+the two images of the step are held, and for the drift check the grey query images of live points.
 
-A point that fails a check of :mod:`uni4d_fg.tracks.optical_flow` is lost, and not looked for again.
+A point that fails a check of :mod:`uni4d_fg.tracks.optical_flow` is lost, and not looked for again. Where the
+forward sweep leaves a cell of the image empty between two grids, a new point starts
+(:mod:`uni4d_fg.tracks.reseeding`), and is followed both ways as well.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.sequence.model import FrameSource
 from uni4d_fg.tracks.model import Tracks
 from uni4d_fg.tracks.optical_flow import has_not_drifted, move_points
+from uni4d_fg.tracks.reseeding import corners_of_empty_cells
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the number of steps in all."""
@@ -70,13 +73,13 @@ def track_grid(
         raise InputError("tracking: the sequence has no images")
     image_size = _grey(images[0], None, 0).shape
     grid = query_grid((image_size[0], image_size[1]), config)
-    query_frames = list(range(0, num_frames, config.query_interval))
-    observations: _Observations = [(frame, _track_indices(i, grid), grid) for i, frame in enumerate(query_frames)]
+    queries: dict[int, _Queries] = {}
+    observations: _Observations = []
     steps_done, steps = 0, 2 * (num_frames - 1)
-    for order in (range(num_frames), range(num_frames - 1, -1, -1)):
-        live = _LivePoints(grid)
+    for forwards in (True, False):
+        live = _LivePoints()
         previous: ImageArray | None = None
-        for frame in order:
+        for frame in range(num_frames) if forwards else range(num_frames - 1, -1, -1):
             if should_stop is not None and should_stop():
                 raise Cancelled(f"tracking stopped at step {steps_done} of {steps}")
             image = _grey(images[frame], image_size, frame)
@@ -86,49 +89,74 @@ def track_grid(
                 steps_done += 1
                 if progress is not None:
                     progress(steps_done, steps)
-            if frame % config.query_interval == 0:
-                live.start(frame // config.query_interval, image)
+            if forwards:
+                started = _new_queries(frame, image, grid, live, config)
+                queries[frame] = _Queries(queries[frame - 1].end if frame else 0, started)
+                observations.append((frame, queries[frame].tracks(), started))
+            live.start(queries[frame], image, config)
             previous = image
-    query_frame = np.repeat(np.asarray(query_frames, np.int32), len(grid))
+    query_frame = np.repeat(
+        np.arange(num_frames, dtype=np.int32), [len(queries[frame].points) for frame in range(num_frames)]
+    )
     return _assemble(observations, query_frame, num_frames, config.min_observations)
+
+
+@dataclass(frozen=True)
+class _Queries:
+    """The tracks that start in one frame; they are numbered in the order of frames."""
+
+    first: int
+    points: Float32Array  # (n, 2) px
+
+    @property
+    def end(self) -> int:
+        return self.first + len(self.points)
+
+    def tracks(self) -> IntArray:
+        return np.arange(self.first, self.end, dtype=np.int64)
+
+
+def _new_queries(
+    frame: int, image: ImageArray, grid: Float32Array, live: _LivePoints, config: TrackingConfig
+) -> Float32Array:
+    """Return where tracks start in a frame of the forward sweep, (n, 2) px."""
+    return grid if frame % config.query_interval == 0 else corners_of_empty_cells(image, live.points, config)
 
 
 @dataclass
 class _LivePoints:
-    """The points that one sweep follows at present.
+    """The points that one sweep follows at present."""
 
-    Track ``i`` belongs to grid ``i // len(grid)`` and started at query point ``i % len(grid)`` of it.
-    """
-
-    grid: Float32Array
     track: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    query_images: dict[int, ImageArray] = field(default_factory=dict)
+    origins: list[tuple[_Queries, ImageArray]] = field(default_factory=list)
+    """Where the points started, and the image there; only for the drift check."""
 
-    def start(self, grid_index: int, image: ImageArray) -> None:
-        """Add the points of a grid in the frame where they start."""
-        self.track = np.concatenate((self.track, _track_indices(grid_index, self.grid)))
-        self.points = np.concatenate((self.points, self.grid))
-        self.query_images[grid_index] = image
+    def start(self, queries: _Queries, image: ImageArray, config: TrackingConfig) -> None:
+        """Add points in the frame where they start."""
+        if len(queries.points) == 0:
+            return
+        self.track = np.concatenate((self.track, queries.tracks()))
+        self.points = np.concatenate((self.points, queries.points))
+        if config.max_drift_px is not None:
+            self.origins.append((queries, image))
 
     def move(self, source: ImageArray, target: ImageArray, config: TrackingConfig) -> None:
         """Follow all points to the next image and forget those that are lost."""
         kept, self.points = move_points(source, target, self.points, config)
         self.track = self.track[kept]
-        grid_of_track, query_point = np.divmod(self.track, len(self.grid))
+        if config.max_drift_px is None:
+            return
         keep = np.ones(len(self.track), np.bool_)
-        for grid_index, query_image in list(self.query_images.items()):
-            members = np.flatnonzero(grid_of_track == grid_index)
-            keep[members] = has_not_drifted(
-                query_image, target, self.grid[query_point[members]], self.points[members], config
-            )
-            if not keep[members].any():
-                del self.query_images[grid_index]
+        alive = []
+        for queries, image in self.origins:
+            members = np.flatnonzero((self.track >= queries.first) & (self.track < queries.end))
+            first = queries.points[self.track[members] - queries.first]
+            keep[members] = has_not_drifted(image, target, first, self.points[members], config)
+            if keep[members].any():
+                alive.append((queries, image))
+        self.origins = alive
         self.track, self.points = self.track[keep], self.points[keep]
-
-
-def _track_indices(grid_index: int, grid: Float32Array) -> IntArray:
-    return np.arange(grid_index * len(grid), (grid_index + 1) * len(grid), dtype=np.int64)
 
 
 def _grey(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> ImageArray:
