@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from stream_samples import stream, stream_config
@@ -108,3 +109,22 @@ def test_the_verb(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, words).exit_code != 0
     again = CliRunner().invoke(app, [*words, "--overwrite"])
     assert again.exit_code == 0, again.output
+
+
+def test_the_verb_on_a_bare_video(tmp_path: Path) -> None:
+    sequence, video = stream(8, objects="none", render_images=True), tmp_path / "alone.mp4"
+    write_native(sequence, tmp_path / "seq")
+    height, width = sequence.image_size
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (width, height))
+    for image in sequence.images:
+        writer.write(image[:, :, ::-1])
+    writer.release()
+    words = ["stream", str(video), "--quiet", "--out", str(tmp_path / "run")]
+    refused = CliRunner().invoke(app, words)
+    assert refused.exit_code != 0
+    assert "has no depth" in str(refused.exception or refused.output)
+    assert not (tmp_path / "run").exists()
+    depth = next(path for path in (tmp_path / "seq").iterdir() if path.name.startswith("depth_cue"))
+    result = CliRunner().invoke(app, [*words, "--depth", str(depth)])
+    assert result.exit_code == 0, result.output
+    assert load_reconstruction(tmp_path / "run" / "reconstruction.npz").num_frames == 8

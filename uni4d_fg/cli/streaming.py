@@ -15,7 +15,7 @@ from uni4d_fg.cli.interruption import Interruption, resume_command
 from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.errors import Cancelled, ConfigError, InputError
 
 if TYPE_CHECKING:
     from uni4d_fg.incremental.model import FrameUpdate
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 
 
 def stream(
-    seq: Annotated[
-        Path, typer.Argument(metavar="SEQ", help="Folder of the sequence, or the video in it.", show_default=False)
-    ],
+    seq: options.VideoPath,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/NAME-stream if not given.")] = None,
     config: options.ConfigChoice = None,
     changes: options.Overrides = None,
@@ -34,10 +32,15 @@ def stream(
     ] = False,
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
+    start: options.Start = 0,
+    stop: options.Stop = None,
+    stride: options.Stride = 1,
+    max_size: options.MaxSize = None,
     layout: options.Layout = LayoutChoice.auto,
-    depth: options.Depth = None,
-    masks: options.Masks = None,
-    tracks: options.Tracks = None,
+    depth: options.DepthFiles = None,
+    masks: options.MaskFiles = None,
+    tracks: options.TrackFiles = None,
+    intrinsics: options.IntrinsicsFile = None,
     known_intrinsics: options.KnownIntrinsics = False,
     quiet: options.Quiet = False,
     json: options.Json = False,
@@ -47,21 +50,29 @@ def stream(
     from uni4d_fg.incremental.stream import stream_sequence
 
     settings = load_config(config, changes or ())
-    root = seq.parent if seq.is_file() else seq
+    if masks == "motion":
+        raise ConfigError("masks from motion need the whole video; make them with 'uni4d-fg cues', or give files")
+    root = _sequence_of(seq, depth)
     source = SequenceInput.of(
-        root, layout, depth, masks, tracks, depth_gt_scale=1000.0, known_intrinsics=known_intrinsics
-    )
-    run = out or Path("runs") / f"{root.resolve().name}-stream"
+        root, layout, depth, masks, tracks, depth_gt_scale=1000.0, known_intrinsics=known_intrinsics,
+        intrinsics=intrinsics, start=start, stop=stop, stride=stride, max_size=max_size,
+    )  # fmt: skip
+    run = out or Path("runs") / f"{root.stem if root.is_file() else root.resolve().name}-stream"
+    if source.open().video.depths is None:
+        raise InputError(
+            f"{root}: has no depth, which 'stream' needs of every frame: give --depth FOLDER or FILE.npy, or make it "
+            "first with 'uni4d-fg cues'"
+        )
     sequence = source.read()
     if online_tracks:
         sequence = replace(sequence, tracks=None)
     prepare_run_folder(run, resume=resume, overwrite=overwrite)
     source.save(run)
-    with Interruption() as stop, progress_reporter(quiet) as reporter:
+    with Interruption() as interrupted, progress_reporter(quiet) as reporter:
         reporter.begin("stream", sequence.num_frames)
         try:
             summary = stream_sequence(
-                sequence, run, settings, resume=resume, on_frame=_LiveProgress(reporter), should_stop=stop
+                sequence, run, settings, resume=resume, on_frame=_LiveProgress(reporter), should_stop=interrupted
             )
         except Cancelled as error:
             raise Cancelled(f"{error}: results so far are in {run}; continue with: {resume_command()}") from error
@@ -70,6 +81,13 @@ def stream(
         print_json(summary.to_dict())
     else:
         typer.echo("\n".join([*summary.lines(), f"results: {run}"]))
+
+
+def _sequence_of(path: Path, depth: str | None) -> Path:
+    """Return the sequence folder that a video file is the video of; the path itself for anything else."""
+    beside = path.parent / "depth_cue"
+    belongs = path.is_file() and depth is None and (beside.is_dir() or beside.with_suffix(".npy").is_file())
+    return path.parent if belongs else path
 
 
 class _LiveProgress:

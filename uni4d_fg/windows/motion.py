@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.windows.plan import Window
 
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -37,7 +37,7 @@ def join_motion(windows: list[Window], weights: list[FloatArray], parts: list[Ar
     instance = np.zeros(len(tracks), dtype=np.int64)
     for window, share, part in zip(windows, weights, parts, strict=True):
         row, frames = np.searchsorted(tracks, part["track"]), slice(window.start, window.stop)
-        known = np.isfinite(part["points"]).all(axis=2)
+        known: BoolArray = np.asarray(np.isfinite(part["points"]).all(axis=2))
         here = known * share
         total[row, frames] += here[..., None] * np.where(known[..., None], part["points"], 0.0)
         weight[row, frames] += here
