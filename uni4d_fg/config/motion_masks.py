@@ -29,6 +29,10 @@ class MotionMaskConfig(Section):
     baselines: tuple[int, ...] = setting(
         (2, 6, 12), "Each frame is compared with the frames this far before and after it.", min_length=1
     )
+    first_guess_step: int = setting(
+        5, "The first guess of what moves compares frames this far apart by the pose that most tracks agree on.", ge=1
+    )
+    first_guess_px: float = setting(3.0, "A track agrees with that pose if it misses by less than this, px.", gt=0)
     max_bundle_observations: int = setting(
         400, "Track observations per frame that the camera solves use, on average.", ge=50
     )

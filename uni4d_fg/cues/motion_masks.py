@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -31,6 +31,7 @@ from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.label_store import CompressedLabels
 from uni4d_fg.cues.moving_regions import moving_region, track_evidence, trusted_components
+from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.static_scene import relative_pose
 from uni4d_fg.cues.track_motion import Cameras, SharedError, TrackMotion, find_moving_tracks
@@ -40,6 +41,7 @@ from uni4d_fg.sequence.model import FrameSource, Video
 from uni4d_fg.tracks.model import Tracks
 
 _MOST_MAY_MOVE = 0.6
+_TURNS = 2
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def motion_masks(
         if count != video.num_frames:
             raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
-    report.begin("motion of tracks", 2)
+    report.begin("motion of tracks", _TURNS)
     cameras, motion = _tracks_and_cameras(video, depths, tracks, intrinsics, config, settings, report, stop)
     report.end()
     report.begin("motion masks", video.num_frames)
@@ -139,18 +141,20 @@ def _tracks_and_cameras(
     """Solve cameras, test tracks, and do both once more without the tracks that move."""
     known = StaticTracks.of(video, depths, tracks, intrinsics, settings)
     spread = spread_at_tracks(known.labelled.tracks, depths, max(1, round(config.depth_edge_px)))
-    moving = np.zeros(tracks.num_tracks, bool)
+    outlier = moving = find_outlier_tracks(known.labelled, intrinsics, config)
     cameras, motion = None, None
-    for turn in range(2):
+    for turn in range(_TURNS):
         cameras = solve_cameras(
             known.without(moving),
             intrinsics,
             settings,
-            free_intrinsics=config.free_intrinsics,
+            # Among the first, what moves would be explained by a wrong focal length.
+            free_intrinsics=config.free_intrinsics and turn > 0,
             observations_per_frame=config.max_bundle_observations,
             should_stop=stop,
         )
         motion = find_moving_tracks(known.labelled, spread, cameras, video.image_size, config)
+        motion = replace(motion, moving=motion.moving | outlier, static=motion.static & ~outlier)
         moving = motion.moving
         report.advance(turn + 1)
     assert cameras is not None
