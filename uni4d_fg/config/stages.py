@@ -103,7 +103,7 @@ class BundleAdjustmentConfig(Section):
         30.0, "A track's observation this many frames from its query frame has twice the variance (tracks drift).", gt=0
     )
     covariance_cells: int = setting(
-        8,
+        5,
         "Static tracks that start in the same cell, of this many along the longer image side, may err alike in any way: "
         "the covariances of the cameras allow for it; 0 takes all observations for independent.",
         ge=0,
