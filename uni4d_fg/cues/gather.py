@@ -215,7 +215,7 @@ class _Gathering:
         self.motion_facts = [f"depth: {fact}" for fact in found.facts]
         if network is None:
             self.motion_warnings = [NOT_METRIC, *found.warnings]
-            report.settings = settings_for_geometry(self.config, found)
+            report.settings = settings_for_geometry(self.config, found.has_parallax)
             self.world_T_cam = found.world_T_cam
             return found.depths
         self.motion_warnings = [NOT_METRIC_RELATIVE, *found.warnings]

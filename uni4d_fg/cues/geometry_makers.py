@@ -18,6 +18,7 @@ from uni4d_fg.cues.cache import FloatMaps, FrameCache, image_key, maker_key
 from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
+from uni4d_fg.errors import Cancelled
 from uni4d_fg.progress import Reporter
 from uni4d_fg.sequence.frames import MaskFolder
 from uni4d_fg.sequence.model import FrameSource, Video
@@ -113,11 +114,15 @@ def moving_masks(
 
 
 def video_key(video: Video, should_stop: ShouldStop) -> str:
-    """Return a key of all images, and of the depth maps that came with them."""
+    """Return a key of all images, and of the depth maps that came with them.
+
+    Raises:
+        Cancelled: If ``should_stop`` said so.
+    """
     digest = hashlib.blake2b(digest_size=16)
     for frame, image in enumerate(video.images):
         if should_stop():
-            break
+            raise Cancelled("stopped while reading the video")
         digest.update(image_key(image).encode())
         if video.depths is not None:
             digest.update(np.ascontiguousarray(video.depths[frame]).data)

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.card import CardKind, find_model
-from uni4d_fg.cues.mask_files import open_mask_files
 from uni4d_fg.cues.session import weights_hash
 from uni4d_fg.optional import import_onnxruntime
 from uni4d_fg.sequence.assemble import check_count, open_depth
@@ -52,6 +51,8 @@ class CueFiles:
             depths[0]
             changes["depths"] = depths
         if self.masks is not None:
+            from uni4d_fg.cues.mask_files import open_mask_files  # takes a second to load
+
             changes["masks"] = open_mask_files(
                 self.masks, size, count, video.frame_names, images=video.images, classes=self.classes
             )
