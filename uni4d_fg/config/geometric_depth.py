@@ -64,8 +64,8 @@ class GeometricDepthConfig(Section):
 class AffineDepthConfig(Section):
     """Scale and shift of every frame of a relative depth network, from points of known depth."""
 
-    huber_threshold: float = setting(1.345, "Residuals above this many measured sigmas count less.", gt=0)
-    max_iterations: int = setting(30, "Largest number of reweighted solves.", ge=1)
+    kernel_threshold: float = setting(2.0, "Residuals above this many measured sigmas count less.", gt=0)
+    max_iterations: int = setting(30, "Largest number of reweighted solves, twice.", ge=1)
     min_points: int = setting(8, "A frame with fewer points has no say of its own and follows its neighbours.", ge=2)
     temporal_sigma: float = setting(
         0.1, "Aligned inverse depth changes from frame to frame by about this part through scale and shift alone.",

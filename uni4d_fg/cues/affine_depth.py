@@ -9,7 +9,8 @@ Points of known depth ``z_{k,t}`` determine both, robustly, all frames at once:
     sum_{k,t} rho( (a_t d_{k,t} + b_t - 1/z_{k,t}) / (sigma m_t) )
       + sum_t sum_q ( ((a_{t+1} - a_t) q + (b_{t+1} - b_t)) / (tau m_t) )^2 / 6
 
-m_t is the frame's median 1/z, sigma the measured noise, rho Huber's kernel; q runs over three quantiles of the
+m_t is the frame's median 1/z, sigma the measured noise, rho a robust kernel (Cauchy's, started
+from Huber's); q runs over three quantiles of the
 network's values at the points, so that tau says how much the aligned inverse depth may change from frame to frame
 through a and b alone, whatever the network's own unit and origin. A frame with many points hardly feels it; one
 with few follows its neighbours.
@@ -29,7 +30,9 @@ from scipy.linalg import solveh_banded
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.geometric_depth import AffineDepthConfig
+from uni4d_fg.cues.structure.triangulation import median_per_row
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
+from uni4d_fg.factors.kernels import Kernel
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.sequence.frames import LazyFrames
 from uni4d_fg.sequence.model import FrameSource
@@ -39,7 +42,7 @@ from uni4d_fg.tracks.model import Tracks
 
 _QUANTILES = (0.1, 0.5, 0.9)
 _MIN_SIGMA = 1e-3
-_CONVERGED = 1e-7
+_CONVERGED = 1e-5
 _RIDGE = 1e-12
 
 
@@ -216,16 +219,20 @@ def _fit(samples: _Samples, count: int, config: AffineDepthConfig, free_shift: b
     weight = np.ones(len(value))
     solution = np.zeros((count, 2))
     sigma = 1.0
-    for _ in range(config.max_iterations):
-        previous = solution
-        solution = _solve(samples.frame, value, target, weight, typical, sigma, link, free_shift)
-        scale = solution[samples.frame, 0] / typical[samples.frame]
-        shift = solution[samples.frame, 1] / typical[samples.frame]
-        residual = scale * value + shift - target
-        sigma = max(robust_sigma(residual), _MIN_SIGMA)
-        weight = 1.0 / np.maximum(np.abs(residual) / (config.huber_threshold * sigma), 1.0)
-        if np.abs(solution - previous).max() <= _CONVERGED * np.abs(solution).max():
-            break
+    # Huber's energy has one minimum, which leads to that of Cauchy's: there far outliers count for nothing.
+    for kernel in (Kernel("huber", config.kernel_threshold), Kernel("cauchy", config.kernel_threshold)):
+        for _ in range(config.max_iterations):
+            previous = solution
+            solution = _solve(samples.frame, value, target, weight, typical, sigma, link, free_shift)
+            scale = solution[samples.frame, 0] / typical[samples.frame]
+            shift = solution[samples.frame, 1] / typical[samples.frame]
+            residual = scale * value + shift - target
+            # About the frame's median: what is off as a whole is not noise, but a fit that outliers still hold.
+            middle = median_per_row(residual, samples.frame, count)[samples.frame]
+            sigma = max(robust_sigma(residual - middle), _MIN_SIGMA)
+            weight = kernel.weight((residual / sigma) ** 2)
+            if np.abs(solution - previous).max() <= _CONVERGED * np.abs(solution).max():
+                break
     slope = solution[:, 0] / unit
     return _Fit(slope, solution[:, 1] - slope * origin if free_shift else np.zeros(count), sigma)
 

@@ -32,6 +32,7 @@ from uni4d_fg.sequence.problems import some_of
 from uni4d_fg.stages.observations import Observations
 from uni4d_fg.tracks.model import Tracks
 
+_UNSURE_FOCAL = 0.03
 _FEW_FRAMES = 0.5
 _MIN_POINTS = 3
 _SPHERE_STEP = 16
@@ -106,24 +107,25 @@ def depth_from_motion(
     return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
 
 
-def settings_for_geometry(config: Config, depth: GeometricDepth) -> Config:
-    """Return the configuration for reconstructing with this depth.
+def settings_for_geometry(config: Config, has_parallax: bool = True) -> Config:
+    """Return the configuration with which to reconstruct from such depth.
 
-    Interpolated depth was made from the tracks, so it says nothing that they do not: bundle adjustment goes
-    without it, and starts from the cameras found with it. Depth of moving things is only where they stand.
-    Where there is no parallax, depth (a convention) is kept as it is, and so are the focal lengths.
+    Stages 1 and 2 take it like any other: they measure its noise. But moving things have depth only where they
+    stand, and the noise of the static scene says nothing of that (``geometric_depth.moving_depth_sigma`` does,
+    unless ``nonrigid.depth_sigma`` is set). Without parallax, depth is a convention that would bend the focal
+    lengths: they are kept.
+
+    Args:
+        config: Of the run.
+        has_parallax: See :class:`GeometricDepth`.
     """
-    if not depth.has_parallax:
-        return config.model_copy(update={"input": config.input.model_copy(update={"intrinsics": "fixed"})})
-    adjustment = config.bundle_adjustment.model_copy(update={"depth_prior": False, "structure": "keep"})
-    sigma = config.geometric_depth.moving_depth_sigma
-    return config.model_copy(
-        update={
-            "bundle_adjustment": adjustment,
-            "nonrigid": config.nonrigid.model_copy(update={"depth_sigma": sigma}),
-            "input": config.input.model_copy(update={"poses": "initial"}),
-        }
-    )
+    update: dict[str, object] = {}
+    if config.nonrigid.depth_sigma is None:
+        sigma = config.geometric_depth.moving_depth_sigma
+        update["nonrigid"] = config.nonrigid.model_copy(update={"depth_sigma": sigma})
+    if not has_parallax:
+        update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
+    return config.model_copy(update=update)
 
 
 def _static_observations(tracks: Tracks, is_static: BoolArray) -> Observations:
@@ -174,6 +176,11 @@ def _doubts(video: Video, structure: Structure) -> list[str]:
         warnings.append(
             f"{len(bridged)} frame(s) see too few points of the static scene, and their cameras are only interpolated"
             f"{' (most of the video: do not trust this result)' if severe else ''}: {some_of(bridged)}"
+        )
+    if not structure.focal_deviation <= _UNSURE_FOCAL:
+        warnings.append(
+            f"this motion hardly tells the focal length (standard deviation {100 * structure.focal_deviation:.0f} %): "
+            "depth is stretched by as much as it is wrong; give K.npy if it is known"
         )
     focal = float(np.mean(structure.intrinsics[:2]))
     side = float(max(video.image_size))

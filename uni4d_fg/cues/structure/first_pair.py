@@ -13,7 +13,7 @@ from uni4d_fg.stages.observations import Observations
 
 _SAMPLED_FRAMES = 20
 _ENOUGH_TRACKS = 300
-_FITTED_TRACKS = 400
+_FITTED_TRACKS = 250
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,17 +12,18 @@ from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
-from uni4d_fg.cues.structure.triangulation import Points, RayBundle, ray_angles, triangulate
+from uni4d_fg.cues.structure.triangulation import RayBundle, ray_angles, sound, triangulate
 from uni4d_fg.cues.structure.two_view import relative_pose
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.graph.state import State, VariableNames
 from uni4d_fg.solve.levenberg_marquardt import Hooks
+from uni4d_fg.solve.marginals import camera_marginals
 from uni4d_fg.solve.summary import Termination
 from uni4d_fg.stages.bundle_adjustment import Freedom, StaticNoise, bundle_adjustment_stage
 from uni4d_fg.stages.observations import Observations
-from uni4d_fg.stages.stage import run_stage
+from uni4d_fg.stages.stage import Stage, run_stage
 
 _RESECTION_TRIALS = 500
 _FOCAL_NEEDS_FRAMES = 3
@@ -126,13 +127,36 @@ class GrowingScene:
         self.position[rows] = np.where(fits[:, None], points.position, np.nan)
         self._judge()
 
-    def adjust(self, hooks: Hooks | None = None) -> None:
+    def adjust(self) -> None:
         """Refine all cameras, points and (from three frames on) the focal lengths; then judge all observations.
 
         Raises:
             Cancelled: If asked to stop.
             SolverError: If the system cannot be solved.
         """
+        stage, state, frames, rows = self._bundle()
+        state, summary = run_stage(stage, state, Hooks(should_stop=self.should_stop))
+        if summary.termination is Termination.CANCELLED:
+            raise Cancelled("structure from motion stopped")
+        self.world_T_cam[frames] = se3.orthonormalize(state["pose"])
+        self.intrinsics = state["intrinsics"][0].copy()
+        self.position[rows] = state["landmark"]
+        self._forget_flat()
+        self._judge()
+
+    def focal_deviation(self) -> float:
+        """Return the marginal standard deviation of the focal lengths, as a part of their value; 0 if held."""
+        stage, state, _, _ = self._bundle()
+        if "intrinsics" not in stage.free:
+            return 0.0
+        marginals = camera_marginals(stage.problem, state, stage.solver, stage.eliminate)
+        if marginals is None:
+            return float("nan")
+        variance = np.diag(marginals.blocks("intrinsics", 1)[0])[:2]
+        return float(np.sqrt(np.max(variance / self.intrinsics[:2] ** 2)))
+
+    def _bundle(self) -> tuple[Stage, State, IntArray, IntArray]:
+        """Return bundle adjustment as a stage, its start, and the frames (t,) and tracks (m,) that take part."""
         self._judge()
         frames = np.flatnonzero(self.registered)
         keep = self.good & self.registered[self.observations.frame]
@@ -140,17 +164,14 @@ class GrowingScene:
         used = self.observations.select(keep)
         position_of = np.full(len(self.registered), -1, dtype=np.int64)
         position_of[frames] = np.arange(len(frames))
-        used = Observations(used.track, position_of[used.frame], used.uv, used.depth, used.weight)
+        used = replace(used, frame=position_of[used.frame])
         rows = np.unique(self.row[keep])
-        tracks, _ = used.rows()
-        state = State(
-            {
-                "pose": self.world_T_cam[frames],
-                "intrinsics": self.intrinsics[None],
-                "landmark": self.position[rows],
-            },
-            VariableNames(landmark_track=tracks),
-        )
+        groups = {
+            "pose": self.world_T_cam[frames],
+            "intrinsics": self.intrinsics[None],
+            "landmark": self.position[rows],
+        }
+        state = State(groups, VariableNames(landmark_track=used.rows()[0]))
         settings = geometric_bundle_adjustment(self.config.bundle_adjustment)
         stage = bundle_adjustment_stage(
             state,
@@ -162,14 +183,7 @@ class GrowingScene:
             unsquared=False,
             normalization="mean",
         )
-        state, summary = run_stage(stage, state, hooks or Hooks(should_stop=self.should_stop))
-        if summary.termination is Termination.CANCELLED:
-            raise Cancelled("structure from motion stopped")
-        self.world_T_cam[frames] = se3.orthonormalize(state["pose"])
-        self.intrinsics = state["intrinsics"][0].copy()
-        self.position[rows] = state["landmark"]
-        self._forget_flat()
-        self._judge()
+        return stage, state, frames, rows
 
     def cost(self, frames: BoolArray) -> float:
         """Return the mean truncated squared error, in [0, 1], over all observations in the given frames (T,).
@@ -225,14 +239,6 @@ class GrowingScene:
         factor = self.config.geometric_depth.median_depth / max(float(np.median(z)), 1e-9)
         self.position *= factor
         self.world_T_cam[:, :3, 3] *= factor
-
-
-def sound(points: Points, max_error_px: float, min_angle_deg: float) -> BoolArray:
-    """Return which triangulated points (M,) fit their tracks and have rays that meet at enough of an angle."""
-    with np.errstate(invalid="ignore"):
-        fits = (points.error_px <= max_error_px) & (points.angle >= np.radians(min_angle_deg))
-    result: BoolArray = fits & np.isfinite(points.position).all(axis=1)
-    return result
 
 
 def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:

@@ -42,6 +42,8 @@ class Structure:
     """Noise of the tracks (robust standard deviation of a reprojection residual)."""
     pair: FramePair
     """The two frames it started from."""
+    focal_deviation: float
+    """Standard deviation of the focal lengths, as a part of their value; 0 if they are held."""
 
 
 def structure_from_motion(
@@ -73,6 +75,8 @@ def structure_from_motion(
     """
     settings = config.geometric_depth
     free_focal = config.input.intrinsics == "free"
+    if should_stop():
+        raise Cancelled("structure from motion stopped")
     used = observations.select(spread_tracks(observations, image_size, settings.max_tracks))
     pairs = rank_pairs(used, num_frames, intrinsics, settings, known_focal=not free_focal)
     pairs = [pair for pair in pairs if pair.parallax_px >= settings.min_parallax_px]
@@ -86,7 +90,7 @@ def structure_from_motion(
     sigma = robust_sigma(scene.errors()[scene.good] / np.sqrt(2.0))
     poses = _bridge(scene.world_T_cam, scene.registered)
     track, points = _triangulate_all(observations, poses, scene)
-    return Structure(poses, scene.intrinsics, scene.registered, track, points, sigma, pair)
+    return Structure(poses, scene.intrinsics, scene.registered, track, points, sigma, pair, scene.focal_deviation())
 
 
 def rotations_only(observations: Observations, num_frames: int, intrinsics: FloatArray) -> FloatArray:

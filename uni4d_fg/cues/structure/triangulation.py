@@ -82,6 +82,14 @@ def triangulate(rays: RayBundle) -> Points:
     return Points(position, information, ray_angles(rays, position), median_per_row(error, rays.row, rays.count))
 
 
+def sound(points: Points, max_error_px: float, min_angle_deg: float) -> BoolArray:
+    """Return which triangulated points (M,) fit their tracks and have rays that meet at enough of an angle."""
+    with np.errstate(invalid="ignore"):
+        fits = (points.error_px <= max_error_px) & (points.angle >= np.radians(min_angle_deg))
+    result: BoolArray = fits & np.isfinite(points.position).all(axis=1)
+    return result
+
+
 def ray_angles(rays: RayBundle, position: FloatArray) -> FloatArray:
     """Return the angle (M,) under which each point (M, 3) sees its cameras, rad.
 

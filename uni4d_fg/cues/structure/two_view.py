@@ -21,8 +21,8 @@ from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, unproject
 
-_FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
-_REWEIGHTINGS = 5
+_FOCAL_FACTORS = np.geomspace(0.5, 2.0, 7)
+_REWEIGHTINGS = 4
 _CONFIDENCE = 0.9999
 _MAX_TRIALS = 5000
 

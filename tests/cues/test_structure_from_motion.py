@@ -1,0 +1,125 @@
+"""Two views, triangulation and selection of tracks on points with a known answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uni4d_fg.cues.structure.selection import spread_tracks
+from uni4d_fg.cues.structure.triangulation import RayBundle, inverse_depth_sigma, sound, triangulate
+from uni4d_fg.cues.structure.two_view import fit_rotation, parallax, relative_pose
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.stages.observations import Observations
+
+K = np.array([300.0, 300.0, 159.5, 119.5])
+
+
+def views(rng: np.random.Generator, second: np.ndarray, count: int = 200, noise_px: float = 0.3) -> tuple:
+    """Points in front of a camera at the origin, and their pixels in it and in ``second``."""
+    points = np.stack([rng.uniform(-1, 1, count), rng.uniform(-0.8, 0.8, count), rng.uniform(1.5, 4, count)], axis=1)
+    uv = [
+        project(K, world_to_camera(pose, points)) + rng.normal(0, noise_px, (count, 2)) for pose in (np.eye(4), second)
+    ]
+    return points, *uv
+
+
+def moved(rotation: tuple[float, ...], translation: tuple[float, ...]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = se3.so3_exp(np.array(rotation)), translation
+    return pose
+
+
+def test_pure_rotation_has_no_parallax_even_with_a_wrong_focal_length(rng: np.random.Generator) -> None:
+    _, first, second = views(rng, moved((0.05, 0.3, 0.02), (0.0, 0.0, 0.0)))
+    wrong = K * np.array([1.3, 1.3, 1.0, 1.0])
+    assert parallax(first, second, K, known_focal=True) < 0.7
+    assert parallax(first, second, wrong, known_focal=False) < 1.0
+    assert parallax(first, second, wrong, known_focal=True) > 1.5
+
+
+def test_translation_has_parallax(rng: np.random.Generator) -> None:
+    _, first, second = views(rng, moved((0.0, 0.1, 0.0), (0.3, 0.0, 0.0)))
+    assert parallax(first, second, K, known_focal=False) > 4.0
+
+
+def test_rotation_is_found_among_outliers(rng: np.random.Generator) -> None:
+    pose = moved((0.03, -0.1, 0.05), (0.0, 0.0, 0.0))
+    _, first, second = views(rng, pose)
+    second[:60] += rng.uniform(10, 40, (60, 2))
+    turn = fit_rotation(first, second, K).second_R_first
+    assert np.degrees(np.linalg.norm(se3.so3_log((turn @ pose[:3, :3])[None]))) < 0.3
+
+
+def test_relative_pose_is_found_among_outliers_and_is_repeatable(rng: np.random.Generator) -> None:
+    pose = moved((0.02, 0.1, -0.03), (0.3, -0.05, 0.1))
+    _, first, second = views(rng, pose)
+    second[:60] = rng.uniform(0, 300, (60, 2))
+    found = relative_pose(first, second, K, 1.5)
+    again = relative_pose(first, second, K, 1.5)
+    assert found is not None
+    assert again is not None
+    np.testing.assert_array_equal(found.first_T_second, again.first_T_second)
+    error = found.first_T_second[:3, :3].T @ pose[:3, :3]
+    assert np.degrees(np.linalg.norm(se3.so3_log(error[None]))) < 0.4
+    direction = pose[:3, 3] / np.linalg.norm(pose[:3, 3])
+    assert np.degrees(np.arccos(found.first_T_second[:3, 3] @ direction)) < 3.0
+    assert found.inlier[60:].mean() > 0.9
+    assert found.inlier[:60].mean() < 0.2
+
+
+def bundle(points: np.ndarray, poses: np.ndarray, uv: np.ndarray) -> RayBundle:
+    """All points in all views: uv (views, points, 2)."""
+    views, count = uv.shape[:2]
+    row = np.tile(np.arange(count), views)
+    return RayBundle(row, np.repeat(poses, count, axis=0), uv.reshape(-1, 2), K, count)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), baseline=st.floats(0.05, 0.5))
+def test_noiseless_points_are_triangulated_exactly(seed: int, baseline: float) -> None:
+    rng = np.random.default_rng(seed)
+    poses = np.stack(
+        [np.eye(4), moved((0.0, 0.05, 0.0), (baseline, 0.0, 0.0)), moved((0.0, 0.0, 0.0), (0.0, baseline, 0.1))]
+    )
+    points, _, _ = views(rng, poses[1], 30)
+    uv = np.stack([project(K, world_to_camera(pose, points)) for pose in poses])
+    found = triangulate(bundle(points, poses, uv))
+    np.testing.assert_allclose(found.position, points, rtol=1e-5, atol=1e-5)
+    assert found.error_px.max() < 1e-3
+
+
+def test_the_stated_deviation_of_inverse_depth_is_the_real_one(rng: np.random.Generator) -> None:
+    poses = np.stack([np.eye(4), moved((0.0, 0.0, 0.0), (0.2, 0.0, 0.0))])
+    points, _, _ = views(rng, poses[1], 1000)
+    uv = np.stack([project(K, world_to_camera(pose, points)) for pose in poses]) + rng.normal(0, 0.2, (2, 1000, 2))
+    found = triangulate(bundle(points, poses, uv))
+    sigma = inverse_depth_sigma(poses[0], found.position, found.information, 0.2)
+    normalized = (1.0 / found.position[:, 2] - 1.0 / points[:, 2]) / sigma
+    assert np.std(normalized) == pytest.approx(1.0, abs=0.1)
+
+
+def test_parallel_rays_and_points_behind_are_no_points() -> None:
+    poses = np.stack([np.eye(4), np.eye(4), np.eye(4)])
+    poses[1, 0, 3] = 0.2
+    # Track 0 is seen twice from one place, track 1 by rays that part in front and meet behind.
+    row = np.array([0, 0, 1, 1])
+    uv = np.array([[100.0, 100.0], [100.0, 100.0], [150.0, 100.0], [200.0, 100.0]])
+    found = triangulate(RayBundle(row, poses[[0, 2, 0, 1]], uv, K, 2))
+    assert np.isnan(found.position[0]).all()
+    assert not sound(found, 3.0, 1.0).any()
+
+
+def test_picked_tracks_cover_every_frame_and_both_sides(rng: np.random.Generator) -> None:
+    count, frames = 2000, 20
+    track, frame = np.divmod(np.arange(count * 5), 5)
+    frame = (frame + track % (frames - 4)).astype(np.int64)
+    x = np.where(track % 10 == 0, 20.0, 280.0)  # one in ten on the left
+    uv = np.stack([x + rng.uniform(-10, 10, len(x)), rng.uniform(10, 230, len(x))], axis=1)
+    ones = np.ones(len(track))
+    picked = spread_tracks(Observations(track, frame, uv, ones, ones), (240, 320), 300)
+    assert len(np.unique(track[picked])) == 300
+    assert np.bincount(frame[picked], minlength=frames).min() > 20
+    assert np.mean(uv[picked, 0] < 160) > 0.2
