@@ -221,7 +221,7 @@ def _fit(samples: _Samples, count: int, config: AffineDepthConfig, free_shift: b
     sigma = 1.0
     # Huber's energy has one minimum, which leads to that of Cauchy's: there far outliers count for nothing.
     for kernel in (Kernel("huber", config.kernel_threshold), Kernel("cauchy", config.kernel_threshold)):
-        for _ in range(config.max_iterations):
+        for iteration in range(config.max_iterations):
             previous = solution
             solution = _solve(samples.frame, value, target, weight, typical, sigma, link, free_shift)
             scale = solution[samples.frame, 0] / typical[samples.frame]
@@ -231,7 +231,8 @@ def _fit(samples: _Samples, count: int, config: AffineDepthConfig, free_shift: b
             middle = median_per_row(residual, samples.frame, count)[samples.frame]
             sigma = max(robust_sigma(residual - middle), _MIN_SIGMA)
             weight = kernel.weight((residual / sigma) ** 2)
-            if np.abs(solution - previous).max() <= _CONVERGED * np.abs(solution).max():
+            # The first solve still has the weights of the kernel before.
+            if iteration and np.abs(solution - previous).max() <= _CONVERGED * np.abs(solution).max():
                 break
     slope = solution[:, 0] / unit
     return _Fit(slope, solution[:, 1] - slope * origin if free_shift else np.zeros(count), sigma)
