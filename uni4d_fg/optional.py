@@ -11,23 +11,40 @@ from uni4d_fg.errors import MissingDependencyError
 _APT_COMMAND = "apt-get install libusb-1.0-0 libgl1 libgomp1"
 
 
-def import_torch() -> Any:
-    """Import PyTorch when it is first needed.
-
-    Returns:
-        The ``torch`` module.
+def _import_extra(name: str, extra: str, needs_it: str) -> Any:
+    """Import a package of an extra when it is first needed.
 
     Raises:
         MissingDependencyError: If the package is not installed or cannot be loaded.
     """
     try:
-        return importlib.import_module("torch")
+        return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        missing = error.name or "torch"
-        command = "pip install 'uni4d-fg[adam]'" if missing == "torch" else f"pip install {missing}"
-        raise MissingDependencyError(f"the Adam solver needs {missing}, not installed: run `{command}`") from error
+        missing = error.name or name
+        command = f"pip install 'uni4d-fg[{extra}]'" if missing == name else f"pip install {missing}"
+        raise MissingDependencyError(f"{needs_it} {missing}, not installed: run `{command}`") from error
     except (ImportError, OSError) as error:
-        raise MissingDependencyError(f"torch cannot be loaded ({error}): install it anew") from error
+        raise MissingDependencyError(f"{name} cannot be loaded ({error}): install it anew") from error
+
+
+def import_torch() -> Any:
+    """Return the module ``torch``. Raises MissingDependencyError."""
+    return _import_extra("torch", "adam", "the Adam solver needs")
+
+
+def import_onnxruntime() -> Any:
+    """Return the module ``onnxruntime``. Raises MissingDependencyError."""
+    return _import_extra("onnxruntime", "cues", "networks need")
+
+
+def import_viser() -> Any:
+    """Return ``viser``, the server of the interactive view. Raises MissingDependencyError."""
+    return _import_extra("viser", "view", "the viewer needs")
+
+
+def import_rerun() -> Any:
+    """Return ``rerun``, which writes ``.rrd`` recordings. Raises MissingDependencyError."""
+    return _import_extra("rerun", "export", "the format rrd needs")
 
 
 def import_open3d() -> Any:
@@ -49,60 +66,3 @@ def import_open3d() -> Any:
         library = re.search(r"lib[\w.+-]*\.so[.\d]*", str(error))
         missing = f"the system library {library.group()} is missing" if library else str(error)
         raise MissingDependencyError(f"open3d cannot be loaded, {missing}: run `{_APT_COMMAND}`") from error
-
-
-def import_onnxruntime() -> Any:
-    """Import ONNX Runtime when it is first needed.
-
-    Returns:
-        The ``onnxruntime`` module.
-
-    Raises:
-        MissingDependencyError: If the package is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("onnxruntime")
-    except ModuleNotFoundError as error:
-        missing = error.name or "onnxruntime"
-        command = "pip install 'uni4d-fg[cues]'" if missing == "onnxruntime" else f"pip install {missing}"
-        raise MissingDependencyError(f"networks need {missing}, which is not installed: run `{command}`") from error
-    except (ImportError, OSError) as error:
-        raise MissingDependencyError(f"onnxruntime cannot be loaded ({error}): install it anew") from error
-
-
-def import_viser() -> Any:
-    """Import viser, the server of the interactive view, when it is first needed.
-
-    Returns:
-        The ``viser`` module.
-
-    Raises:
-        MissingDependencyError: If the package is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("viser")
-    except ModuleNotFoundError as error:
-        missing = error.name or "viser"
-        command = "pip install 'uni4d-fg[view]'" if missing == "viser" else f"pip install {missing}"
-        raise MissingDependencyError(f"the viewer needs {missing}, not installed: run `{command}`") from error
-    except (ImportError, OSError) as error:
-        raise MissingDependencyError(f"viser cannot be loaded ({error}): install it anew") from error
-
-
-def import_rerun() -> Any:
-    """Import rerun, which writes ``.rrd`` recordings, when it is first needed.
-
-    Returns:
-        The ``rerun`` module.
-
-    Raises:
-        MissingDependencyError: If the package is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("rerun")
-    except ModuleNotFoundError as error:
-        missing = error.name or "rerun"
-        command = "pip install 'uni4d-fg[export]'" if missing == "rerun" else f"pip install {missing}"
-        raise MissingDependencyError(f"the format rrd needs {missing}, not installed: run `{command}`") from error
-    except (ImportError, OSError) as error:
-        raise MissingDependencyError(f"rerun cannot be loaded ({error}): install it anew") from error

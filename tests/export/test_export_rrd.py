@@ -16,7 +16,7 @@ from export_checks import seen_landmarks
 
 from uni4d_fg.errors import MissingDependencyError, OutputError
 from uni4d_fg.export import export_run
-from uni4d_fg.export.rrd import instance_colors, tails
+from uni4d_fg.export.rrd import tails
 from uni4d_fg.export.source import RunSource
 
 reader = pytest.importorskip("rerun.chunk")
@@ -129,15 +129,6 @@ def test_tails_stop_at_gaps_and_at_their_length(source: RunSource) -> None:
     assert [strip[:, 0].tolist() for strip in strips] == [[0, 1, 2, 3, 4], [2, 3, 4]]
     assert [s[:, 0].tolist() for s in tails(result, 4, 2)[0]] == [[2, 3, 4], [2, 3, 4]]  # type: ignore[arg-type]
     assert tails(result, 0, 10)[0] == []  # type: ignore[arg-type]
-
-
-def test_an_instance_keeps_its_colour() -> None:
-    colors = instance_colors(np.array([7, 1, 7, 2], dtype=np.int32))
-    assert colors.shape == (4, 3)
-    np.testing.assert_array_equal(colors[0], colors[2])
-    np.testing.assert_array_equal(colors[0], instance_colors(np.array([7], dtype=np.int32))[0])
-    assert len(np.unique(colors, axis=0)) == 3
-    assert instance_colors(np.zeros(0, dtype=np.int32)).shape == (0, 3)
 
 
 def test_a_full_disk_is_an_error_and_leaves_nothing(source: RunSource, tmp_path: Path) -> None:

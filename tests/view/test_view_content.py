@@ -11,8 +11,15 @@ from hypothesis import strategies as st
 from viewing_samples import NUM_FRAMES, copied, opened
 
 from uni4d_fg.reconstruction.clouds import read_ply
+from uni4d_fg.reconstruction.colors import (
+    BRIDGED_AMBER,
+    STATIC_GREY,
+    UNKNOWN_GREY,
+    instance_colors,
+    value_colors,
+    value_range,
+)
 from uni4d_fg.view.coloring import ColorBy, Coloring, values_of
-from uni4d_fg.view.colors import BRIDGED_AMBER, STATIC_GREY, UNKNOWN_GREY, instance_colors, value_colors, value_range
 from uni4d_fg.view.content import ColoredPoints, Limits, RunClouds, thumbnail
 from uni4d_fg.view.layers import spaced_cameras
 from uni4d_fg.view.tails import tail_segments

@@ -240,12 +240,12 @@ def remove_results(folder: Path) -> None:
     run = RunFolder(folder)
     files = (
         run.reconstruction, run.trajectory, run.depth, run.summary, run.config, run.labels, folder / STORED_INPUT,
-        folder / CUE_FOLDER / MANIFEST,
+        folder / CUE_FOLDER / MANIFEST, run.report,
     )  # fmt: skip
     try:
         for path in files:
             path.unlink(missing_ok=True)
-        for path in (run.static_cloud.parent, run.trajectory_picture.parent, folder / "stages"):
+        for path in (run.static_cloud.parent, run.trajectory_picture.parent, folder / "stages", run.exports):
             if path.is_dir():
                 shutil.rmtree(path)
     except OSError as error:

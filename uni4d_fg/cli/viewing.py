@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uni4d_fg.cli import options
+from uni4d_fg.reconstruction.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from uni4d_fg.view.opened_run import OpenedRun
@@ -46,7 +47,7 @@ def report(
     """Write one self-contained HTML page about a run: what was done, how well, and what to distrust."""
     from uni4d_fg.report.build import write_report
 
-    path = out or run / "report.html"
+    path = out or RunFolder(run).report
     write_report(_open(run), path)
     typer.echo(f"report: {path}")
 

@@ -17,7 +17,6 @@ pixel centres at 0.5 (https://github.com/rerun-io/rerun/issues/3896): 0.5 is add
 
 from __future__ import annotations
 
-import colorsys
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +27,11 @@ from uni4d_fg.export.clouds import moving_cloud, static_cloud
 from uni4d_fg.export.frames import encode
 from uni4d_fg.export.model import ExportJob
 from uni4d_fg.optional import import_rerun
+from uni4d_fg.reconstruction.colors import instance_colors
 from uni4d_fg.reconstruction.model import Reconstruction
 from uni4d_fg.sequence.calibration import intrinsics_matrix
 
 CAMERA, IMAGE = "world/camera", "world/camera/image"
-_HUE_STEP = 0.61803398875
 """Successive multiples of the golden ratio are far apart on the circle of hues, however many there are."""
 
 
@@ -121,13 +120,6 @@ def tails(result: Reconstruction, frame: int, length: int) -> tuple[list[Float32
     count = np.cumprod(known, axis=1, dtype=np.int64).sum(axis=1)
     row = np.flatnonzero(count >= 2).astype(np.int32)
     return [window[k, window.shape[1] - count[k] :] for k in row.tolist()], row
-
-
-def instance_colors(instance: Int32Array) -> ImageArray:
-    """Return a colour (N, 3) RGB per instance id (N,): hues far apart, the same for the same id in every run."""
-    ids, row = np.unique(instance, return_inverse=True)
-    hues = [colorsys.hsv_to_rgb((int(i) * _HUE_STEP) % 1.0, 0.75, 1.0) for i in ids]
-    return np.rint(255.0 * np.array(hues).reshape(-1, 3)).astype(np.uint8)[row]
 
 
 def _points(rerun: Any, points: Any, colors: ImageArray) -> Any:

@@ -51,7 +51,7 @@ def export_run(
         Cancelled: If ``should_stop`` turned true.
     """
     chosen = {name: exporter(name) for name in formats}
-    root = source.folder.root / "export" if out is None else out
+    root = source.folder.exports if out is None else out
     for name, one in chosen.items():
         one.require()
         _check_target(root / name, overwrite)

@@ -65,3 +65,13 @@ class RunFolder:
     def scene_picture(self) -> Path:
         """Rendered views of the 4D cloud (``.png``)."""
         return self.root / "pictures" / "scene.png"
+
+    @property
+    def report(self) -> Path:
+        """One page about the run (``.html``), where it was asked for."""
+        return self.root / "report.html"
+
+    @property
+    def exports(self) -> Path:
+        """Folder of the run in the formats of other programs, where they were asked for."""
+        return self.root / "export"

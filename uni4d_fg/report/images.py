@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
-from uni4d_fg.view.colors import value_colors
+from uni4d_fg.reconstruction.colors import value_colors
 from uni4d_fg.view.content import thumbnail
 
 _MISSING = (150, 155, 162)

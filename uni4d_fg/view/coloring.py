@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, ImageArray
-from uni4d_fg.view.colors import (
+from uni4d_fg.reconstruction.colors import (
     BRIDGED_AMBER,
     STATIC_GREY,
     css_gradient,

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
+from uni4d_fg.reconstruction.colors import CURRENT_ORANGE
 from uni4d_fg.reconstruction.model import Reconstruction
 from uni4d_fg.view.coloring import Coloring
-from uni4d_fg.view.colors import CURRENT_ORANGE
 from uni4d_fg.view.content import ColoredPoints, Limits, RunClouds, thumbnail
 from uni4d_fg.view.opened_run import OpenedRun
 from uni4d_fg.view.tails import tail_segments
