@@ -125,7 +125,7 @@ def test_an_override_can_give_a_whole_section() -> None:
     ("override", "parts"),
     [
         ("camera_init.windw=3", ["--set", "camera_init.windw", "unknown field", "camera_init.window?"]),
-        ("window=3", ["window: unknown field", "camera_init.window?"]),
+        ("max_tracks_per_pair=3", ["max_tracks_per_pair: unknown field", "camera_init.max_tracks_per_pair?"]),
         ("zzz.qqq=3", ["zzz.qqq: unknown field", "closest"]),
         ("energy.x=3", ["energy.x: unknown field"]),
         ("output={cloud: true}", ["output.cloud: unknown field", "output.clouds?"]),

@@ -46,7 +46,7 @@ def validate(
 
 
 def track(
-    seq: options.SequenceFolder,
+    seq: options.VideoPath,
     out: Annotated[Path | None, typer.Option(help="Track file; SEQ/tracks.npz if not given.")] = None,
     config: options.ConfigChoice = None,
     changes: options.Overrides = None,
@@ -70,26 +70,26 @@ def track(
 
 
 def images_and_track_file(seq: Path, out: Path | None, overwrite: bool) -> tuple[FrameSource[ImageArray], Path]:
-    """Open the images of a sequence, whatever its other files, and choose where its tracks go.
+    """Open the images of a sequence, a folder or a video file, and choose where its tracks go.
 
     Raises:
-        InputError: If there are no images, or the layout has no place for the tracks and ``out`` is not given.
+        InputError: If there are no images, or there is no place for the tracks and ``out`` is not given.
         OutputError: If the file exists and is not to be replaced.
     """
     from uni4d_fg.sequence.assemble import open_images
-    from uni4d_fg.sequence.layout import check_root, find_images, missing_images
+    from uni4d_fg.sequence.layout import find_images
+    from uni4d_fg.sequence.open_video import open_video
     from uni4d_fg.sequence.uni4d_layout import is_uni4d_layout
 
-    check_root(seq)
-    found = find_images(seq)
-    if found is None:
-        raise missing_images(seq)
-    if out is None and is_uni4d_layout(seq):
-        raise InputError(f"{seq}: Uni4D's layout has no place for these tracks; choose a file with --out")
+    own = find_images(seq) if seq.is_dir() else None
+    # The other cues of a sequence folder may be missing or broken: tracks need images only.
+    images = open_video(seq).images if own is None else open_images(own)
+    if out is None and (own is None or is_uni4d_layout(seq)):
+        raise InputError(f"{seq}: has no place for these tracks; choose a file with --out")
     path = out or seq / "tracks.npz"
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists already; replace it with --overwrite or choose another --out")
-    return open_images(found), path
+    return images, path
 
 
 def synthesize(
