@@ -57,7 +57,7 @@ class MotionMaskConfig(Section):
     track_quantile: float = setting(
         0.8, "Quantile of a track's departures over its frame pairs that is compared with both.", gt=0, le=1
     )
-    track_weight: float = setting(1.5, "Evidence of a track at its own pixel, in units of log odds.", ge=0)
+    track_weight: float = setting(2.0, "Evidence of a track at its own pixel, in units of log odds.", ge=0)
     intensity_sigma: float = setting(4.0, "Standard deviation of a pixel's intensity, grey levels.", gt=0)
     occlusion_margin: float = setting(
         0.1, "A point is hidden in another frame whose depth there is smaller by more than this fraction.", gt=0

@@ -104,8 +104,8 @@ class BundleAdjustmentConfig(Section):
     )
     covariance_cells: int = setting(
         5,
-        "Static tracks that start in the same cell, of this many along the longer image side, may err alike in any way: "
-        "the covariances of the cameras allow for it; 0 takes all observations for independent.",
+        "Static tracks that start in the same cell, of this many along the longer image side, may err alike in any "
+        "way: the covariances of the cameras allow for it; 0 takes all observations for independent.",
         ge=0,
         le=64,
     )

@@ -1,8 +1,8 @@
 """A first guess of which tracks move, before any cameras are known.
 
-Between frames a few steps apart, the pose that most tracks agree on is found by RANSAC from their depth in one frame and
-their pixels in the other. A least-squares solve over all tracks, robust kernels or not, would be drawn towards a large
-moving thing; the pose of the majority is not.
+Between frames a few steps apart, the pose that most tracks agree on is found by RANSAC from their depth in one frame
+and their pixels in the other. A least-squares solve over all tracks, robust kernels or not, would be drawn towards a
+large moving thing; the pose of the majority is not.
 """
 
 from __future__ import annotations

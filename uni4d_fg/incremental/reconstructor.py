@@ -26,7 +26,7 @@ from uni4d_fg.solve.backend import choose_backend
 from uni4d_fg.stages.bundle_adjustment import StaticNoise
 from uni4d_fg.stages.stage import LevenbergMarquardtRunner
 
-_TRIM_INTERVAL = 5
+_TRIM_INTERVAL = 1
 """Frames after which freed memory is given back."""
 
 

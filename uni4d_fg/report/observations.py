@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from uni4d_fg.reconstruction.colors import css_gradient, value_range
 from uni4d_fg.reconstruction.pictures.figure import spread_frames
 from uni4d_fg.report.chart import Line, line_chart
 from uni4d_fg.report.images import residual_picture
 from uni4d_fg.report.markup import Markup, color_bar, element, figure, picture, section, table
-from uni4d_fg.reconstruction.colors import css_gradient, value_range
 from uni4d_fg.view.opened_run import OpenedRun
 from uni4d_fg.view.residuals import Residuals
 

@@ -1,0 +1,268 @@
+"""Masks from motion alone: the tests of tracks and pixels one by one, then whole scenes with known masks."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uni4d_fg.config.models import Config
+from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.cues.depth_range import UNKNOWN_RANGE, depth_range
+from uni4d_fg.cues.guided_filter import guided_filter
+from uni4d_fg.cues.motion_masks import MotionMasks, motion_masks
+from uni4d_fg.cues.moving_regions import trusted_components
+from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
+from uni4d_fg.cues.static_scene import predict_static, relative_pose
+from uni4d_fg.cues.track_motion import Cameras, TrackMotion, find_moving_tracks
+from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.evaluate.alignment import align_trajectories
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
+from uni4d_fg.sequence.model import ArrayFrames, Video
+from uni4d_fg.sequence.read import read_sequence
+from uni4d_fg.synthetic import Simulation, SyntheticSceneConfig, simulate
+from uni4d_fg.tracks.lucas_kanade import track_grid
+from uni4d_fg.tracks.model import LabelledTracks, Tracks
+
+INTRINSICS = np.array([200.0, 210.0, 79.5, 59.5])
+
+
+def video_of(simulation: Simulation) -> Video:
+    sequence = simulation.sequence
+    return Video("synthetic", sequence.images, sequence.image_size, sequence.timestamps)
+
+
+def masks_of(simulation: Simulation, **changes: object) -> MotionMasks:
+    sequence = simulation.sequence
+    assert sequence.tracks is not None
+    # The images are small.
+    config = MotionMaskConfig(baselines=(2, 5), depth_edge_px=7, smoothing_px=6, grow_px=1, **changes)
+    return motion_masks(video_of(simulation), sequence.depths, sequence.tracks, sequence.intrinsics, config)
+
+
+def overlap(found: np.ndarray, true: np.ndarray) -> float:
+    """Mean intersection over union over the frames in which there is anything to find."""
+    pairs = [(a, b) for a, b in zip(found > 0, true > 0, strict=True) if b.any()]
+    return float(np.mean([(a & b).sum() / (a | b).sum() for a, b in pairs]))
+
+
+@pytest.fixture(scope="module")
+def moving_scene() -> Simulation:
+    return simulate(
+        SyntheticSceneConfig(
+            num_frames=12, height=120, width=160, focal=150.0, margin_px=3, grid_columns=24, grid_rows=18,
+            frame_rate=10.0,
+        )
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def static_scene() -> Simulation:
+    return simulate(
+        SyntheticSceneConfig(
+            num_frames=8, height=120, width=160, focal=150.0, margin_px=3, grid_columns=24, grid_rows=18,
+            frame_rate=10.0, objects="none",
+        )
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def moving_result(moving_scene: Simulation) -> MotionMasks:
+    return masks_of(moving_scene)
+
+
+def test_the_static_prediction_is_the_projection_and_its_slope_the_derivative(rng: np.random.Generator) -> None:
+    uv, depth = rng.uniform((0, 0), (160, 120), (50, 2)), rng.uniform(1, 4, 50)
+    poses = np.stack([np.eye(4), se3.se3_exp(rng.normal(0, 0.1, 6))])
+    static = predict_static(uv[:, 0], uv[:, 1], np.log(depth), relative_pose(poses, 0, 1), INTRINSICS)
+    point = camera_to_world(poses[[0] * 50], unproject(INTRINSICS, uv, depth))
+    there = world_to_camera(poses[[1] * 50], point)
+    expected = project(INTRINSICS, there)
+    np.testing.assert_allclose(np.stack((static.u, static.v), axis=1), expected, atol=1e-3)
+    np.testing.assert_allclose(static.log_z, np.log(there[:, 2]), atol=1e-5)
+    near, far = (
+        predict_static(uv[:, 0], uv[:, 1], np.log(depth) + h, relative_pose(poses, 0, 1), INTRINSICS)
+        for h in (-1e-3, 1e-3)
+    )
+    np.testing.assert_allclose(static.du, (far.u - near.u) / 2e-3, atol=0.02)
+    np.testing.assert_allclose(static.dv, (far.v - near.v) / 2e-3, atol=0.02)
+
+
+def test_depth_range_knows_edges_and_holes() -> None:
+    depth = np.full((20, 30), 2.0, np.float32)
+    depth[:, 15:], depth[5, 5], depth[:, 25:] = 4.0, np.nan, np.nan
+    around = depth_range(depth, 3)
+    assert around.spread[10, 10] == 0
+    assert around.spread[10, 14] == pytest.approx(np.log(2), abs=1e-6)
+    assert around.spread[5, 5] == around.spread[10, 28] == np.float32(UNKNOWN_RANGE)
+    assert around.log_depth[5, 5] == pytest.approx(np.log(2), abs=1e-6)
+    assert bool(around.known[5, 5])
+    assert not around.known[10, 28]
+    assert np.isfinite(around.log_depth).all()
+
+
+def test_the_guided_filter_keeps_the_edges_of_its_guide(rng: np.random.Generator) -> None:
+    guide = np.zeros((60, 80, 3), np.float32)
+    guide[:, 40:] = (0.8, 0.2, 0.4)
+    truth = np.where(guide[..., 0] > 0, 1.0, -1.0)
+    smooth = guided_filter(guide, (truth + rng.normal(0, 1, truth.shape)).astype(np.float32), 8, 0.03)
+    assert np.abs(smooth - truth).max() < 0.6
+    assert np.abs(smooth - truth).mean() < 0.1
+
+
+def labelled_scene(rng: np.random.Generator, poses: np.ndarray) -> tuple[LabelledTracks, np.ndarray]:
+    """300 static points and 60 that drift by 3 cm per frame, seen by cameras with known poses."""
+    count, frames = 360, len(poses)
+    start = unproject(INTRINSICS, rng.uniform((5, 5), (155, 115), (count, 2)), rng.uniform(1.5, 3.0, count))
+    moves = np.arange(count) >= 300
+    world = start[:, None] + np.where(moves[:, None, None], np.arange(frames)[:, None] * np.array([0.03, 0.01, 0]), 0)
+    camera = np.stack([world_to_camera(np.tile(p, (count, 1, 1)), world[:, t]) for t, p in enumerate(poses)], axis=1)
+    uv = project(INTRINSICS, camera) + rng.normal(0, 0.3, (count, frames, 2))
+    depth = camera[..., 2] * np.exp(rng.normal(0, 0.02, (count, frames)))
+    inside = (uv > 0).all(axis=2) & (uv < (159, 119)).all(axis=2)
+    tracks = Tracks(
+        np.where(inside[..., None], uv, np.nan).astype(np.float32), inside, np.zeros(count, np.int32)
+    )  # fmt: skip
+    zero = np.zeros(count, np.int32)
+    return LabelledTracks(tracks, zero, zero, inside.astype(np.float32), depth.astype(np.float32)), moves
+
+
+def test_tracks_that_move_are_told_from_those_that_do_not(rng: np.random.Generator) -> None:
+    poses = np.stack([se3.se3_exp(t * np.array([0.002, 0.004, 0.001, 0.02, 0.0, 0.005])) for t in range(10)])
+    labelled, moves = labelled_scene(rng, poses)
+    config = MotionMaskConfig()
+    first = find_outlier_tracks(labelled, INTRINSICS * (1.1, 1.1, 1, 1), config)
+    assert first[moves].mean() > 0.9
+    assert first[~moves].mean() < 0.05
+    spread = np.zeros(labelled.depth.shape, np.float32)
+    found = find_moving_tracks(labelled, spread, Cameras(poses, INTRINSICS, np.zeros(10)), (120, 160), config)
+    assert found.moving[moves].mean() > 0.95
+    assert found.static[~moves].mean() > 0.95
+    assert not (found.static & moves).any()
+    assert found.moving[~moves].mean() < 0.02
+
+
+def test_depth_may_be_wrong_where_it_varies_and_motion_across_the_epipolar_line_still_counts(
+    rng: np.random.Generator,
+) -> None:
+    # The camera moves to the right: parallax is horizontal. Depth is wrong by 60 % for 40 static tracks.
+    poses = np.stack([se3.se3_exp(t * np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0])) for t in range(10)])
+    labelled, moves = labelled_scene(rng, poses)
+    depth, spread = labelled.depth.copy(), np.zeros(labelled.depth.shape, np.float32)
+    depth[:40] *= 1.6
+    config, cameras = MotionMaskConfig(), Cameras(poses, INTRINSICS, np.zeros(10))
+    wrong = dataclasses.replace(labelled, depth=depth)
+    sure = find_moving_tracks(wrong, spread, cameras, (120, 160), config)
+    assert sure.moving[:40].mean() > 0.5
+    spread[:40] = 1.0
+    unsure = find_moving_tracks(wrong, spread, cameras, (120, 160), config)
+    assert unsure.moving[:40].mean() < 0.05
+    lost = dataclasses.replace(labelled, depth=np.where(moves[:, None], np.float32(np.nan), labelled.depth))
+    vertical = find_moving_tracks(lost, spread, cameras, (120, 160), config)
+    assert vertical.moving[moves].mean() > 0.5  # by their 1 cm per frame downwards
+
+
+def test_a_region_whose_tracks_are_static_is_not_believed() -> None:
+    region = np.zeros((120, 160), bool)
+    region[20:60, 20:60], region[80:110, 80:110], region[5, 5] = True, True, True
+    uv = np.array([[[30, 30]], [[40, 40]], [[90, 90]], [[95, 95]]], np.float32)
+    tracks = Tracks(uv, np.ones((4, 1), bool), np.zeros(4, np.int32))
+    moving = np.array([True, True, False, True])
+    motion = TrackMotion(moving, np.array([False, False, True, False]), np.zeros(4))
+    config = MotionMaskConfig(grow_px=0, max_static_fraction=0.4)
+    kept = trusted_components(region, tracks, motion, 0, config)
+    assert [int(m.sum()) for m in kept] == [1600]
+    kept = trusted_components(region, tracks, motion, 0, MotionMaskConfig(grow_px=0, max_static_fraction=0.5))
+    assert sorted(int(m.sum()) for m in kept) == [900, 1600]
+
+
+def test_moving_things_are_masked(moving_scene: Simulation, moving_result: MotionMasks) -> None:
+    labels = np.stack(list(moving_result.labels))
+    assert labels.dtype == np.int32
+    assert overlap(labels, moving_scene.masks) > 0.7
+    assert (labels > 0)[moving_scene.masks == 0].mean() < 0.03
+    for instance in (1, 2):
+        assert (labels > 0)[moving_scene.masks == instance].mean() > 0.7
+    moves = moving_scene.tracks.instance > 0
+    assert moving_result.tracks.moving[moves].mean() > 0.9
+    assert moving_result.tracks.moving[~moves].mean() < 0.12
+
+
+def test_the_cameras_are_not_drawn_to_what_moves(moving_scene: Simulation, moving_result: MotionMasks) -> None:
+    truth = moving_scene.sequence.ground_truth
+    assert truth.world_T_cam is not None
+    found = align_trajectories(moving_result.cameras.world_T_cam, truth.world_T_cam)
+    miss = found.apply(moving_result.cameras.world_T_cam[:, :3, 3]) - truth.world_T_cam[:, :3, 3]
+    assert np.sqrt((miss**2).sum(axis=1).mean()) < 0.02
+    assert abs(moving_result.cameras.intrinsics[0] / 150.0 - 1) < 0.15
+
+
+def test_nothing_is_masked_in_a_static_scene(static_scene: Simulation) -> None:
+    result = masks_of(static_scene)
+    labels = np.stack(list(result.labels))
+    assert (labels > 0).mean() < 0.01
+    assert result.warnings == []
+    assert result.tracks.moving.mean() < 0.12  # 2 % of their observations are displaced on purpose
+
+
+def test_input_that_does_not_fit_and_a_stop_are_clear(static_scene: Simulation) -> None:
+    sequence, video = static_scene.sequence, video_of(static_scene)
+    assert sequence.tracks is not None
+    config = MotionMaskConfig()
+    short = ArrayFrames(np.stack(list(sequence.depths))[:5])
+    with pytest.raises(InputError, match="5 depth maps, but 8 images"):
+        motion_masks(video, short, sequence.tracks, sequence.intrinsics, config)
+    for limit in (1, 12):
+        asked: list[int] = []
+
+        def stop(asked: list[int] = asked, limit: int = limit) -> bool:
+            asked.append(1)
+            return len(asked) > limit
+
+        with pytest.raises(Cancelled):
+            motion_masks(video, sequence.depths, sequence.tracks, sequence.intrinsics, config, None, stop)
+
+
+def real_masks(root: Path, name: str, step: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return found masks, true masks and the trajectory error of the cameras the masks were made with."""
+    folder = root / name
+    if not (folder / "c2w.npy").is_file():
+        pytest.skip(f"{folder} is not there")
+    sequence = read_sequence(folder)
+    frames = range(0, sequence.num_frames, step)
+    images, depths, truth = (
+        np.stack([source[f] for f in frames]) for source in (sequence.images, sequence.depths, sequence.masks)
+    )
+    video = Video(name, ArrayFrames(images), sequence.image_size, sequence.timestamps[list(frames)])
+    tracking = Config().tracking.model_copy(update={"query_interval": max(3, 10 // step)})
+    tracks = track_grid(video.images, tracking)
+    baselines = tuple(sorted({max(1, b // step) for b in MotionMaskConfig().baselines}))
+    config = MotionMaskConfig(baselines=baselines, first_guess_step=max(1, 5 // step))
+    result = motion_masks(video, ArrayFrames(depths), tracks, sequence.intrinsics, config)
+    true_poses = sequence.ground_truth.world_T_cam
+    assert true_poses is not None
+    true_poses = true_poses[list(frames)]
+    aligned = align_trajectories(result.cameras.world_T_cam, true_poses).apply(result.cameras.world_T_cam[:, :3, 3])
+    error = float(np.sqrt(((aligned - true_poses[:, :3, 3]) ** 2).sum(axis=1).mean()))
+    return np.stack(list(result.labels)), truth, error
+
+
+@pytest.mark.data
+def test_the_dog_in_the_kitchen(data_root: Path) -> None:
+    labels, truth, error = real_masks(data_root, "kitchen_dog", 3)
+    assert overlap(labels, truth) > 0.75
+    assert error < 0.0065
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "least_overlap", "most_area"), [("kitchen_dog", 0.8, 0.2), ("kitchen", 0, 0.01)])
+def test_every_frame_of_the_kitchen(data_root: Path, name: str, least_overlap: float, most_area: float) -> None:
+    labels, truth, error = real_masks(data_root, name, 1)
+    if truth.any():
+        assert overlap(labels, truth) > least_overlap
+    assert (labels > 0).mean() < most_area
+    assert error < 0.0055
