@@ -183,8 +183,8 @@ class _Validation:
             self.findings.add(
                 "info",
                 "masks",
-                "there are no masks: the whole scene is taken as static",
-                "add masks if things move",
+                "there are no masks: with depth the whole scene is taken as static, else they come from motion",
+                "add masks if things move, or have them made: reconstruct --masks motion, or --mask-model",
             )
             return
         frames = self.findings.attempt("masks", lambda: assemble.open_masks(path, self.size))
