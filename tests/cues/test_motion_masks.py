@@ -35,12 +35,14 @@ def video_of(simulation: Simulation) -> Video:
     return Video("synthetic", sequence.images, sequence.image_size, sequence.timestamps)
 
 
-def masks_of(simulation: Simulation, **changes: object) -> MotionMasks:
+def masks_of(simulation: Simulation, depths: np.ndarray | None = None, tracks: Tracks | None = None) -> MotionMasks:
     sequence = simulation.sequence
-    assert sequence.tracks is not None
+    tracks = sequence.tracks if tracks is None else tracks
+    assert tracks is not None
     # The images are small.
-    config = MotionMaskConfig(baselines=(2, 5), depth_edge_px=7, smoothing_px=6, grow_px=1, **changes)
-    return motion_masks(video_of(simulation), sequence.depths, sequence.tracks, sequence.intrinsics, config)
+    config = MotionMaskConfig(baselines=(2, 5), depth_edge_px=7, smoothing_px=6, grow_px=1)
+    source = sequence.depths if depths is None else ArrayFrames(depths)
+    return motion_masks(video_of(simulation), source, tracks, sequence.intrinsics, config)
 
 
 def overlap(found: np.ndarray, true: np.ndarray) -> float:
@@ -50,23 +52,20 @@ def overlap(found: np.ndarray, true: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def moving_scene() -> Simulation:
-    return simulate(
-        SyntheticSceneConfig(
-            num_frames=12, height=120, width=160, focal=150.0, margin_px=3, grid_columns=24, grid_rows=18,
-            frame_rate=10.0,
-        )
-    )  # fmt: skip
+def moving_config() -> SyntheticSceneConfig:
+    return SyntheticSceneConfig(
+        num_frames=12, height=120, width=160, focal=150.0, margin_px=3, grid_columns=24, grid_rows=18, frame_rate=10.0
+    )
 
 
 @pytest.fixture(scope="module")
-def static_scene() -> Simulation:
-    return simulate(
-        SyntheticSceneConfig(
-            num_frames=8, height=120, width=160, focal=150.0, margin_px=3, grid_columns=24, grid_rows=18,
-            frame_rate=10.0, objects="none",
-        )
-    )  # fmt: skip
+def moving_scene(moving_config: SyntheticSceneConfig) -> Simulation:
+    return simulate(moving_config)
+
+
+@pytest.fixture(scope="module")
+def static_scene(moving_config: SyntheticSceneConfig) -> Simulation:
+    return simulate(moving_config.model_copy(update={"objects": "none", "num_frames": 8}))
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +205,52 @@ def test_nothing_is_masked_in_a_static_scene(static_scene: Simulation) -> None:
     assert (labels > 0).mean() < 0.01
     assert result.warnings == []
     assert result.tracks.moving.mean() < 0.12  # 2 % of their observations are displaced on purpose
+
+
+def test_a_camera_at_rest(moving_config: SyntheticSceneConfig) -> None:
+    scene = simulate(moving_config.model_copy(update={"path": "static", "num_frames": 8}))
+    result = masks_of(scene)
+    labels = np.stack(list(result.labels))
+    assert overlap(labels, scene.masks) > 0.75
+    assert (labels > 0)[scene.masks == 0].mean() < 0.04
+    step = np.linalg.norm(np.diff(result.cameras.world_T_cam[:, :3, 3], axis=0), axis=1)
+    assert step.max() < 0.02
+
+
+def test_missing_depth_costs_little_and_no_depth_is_one_error(
+    moving_scene: Simulation, moving_result: MotionMasks
+) -> None:
+    depths = np.stack(list(moving_scene.sequence.depths))
+    holes = depths.copy()
+    holes[4], holes[:, 90:, :60] = np.nan, np.nan  # a frame without depth, and a corner that no frame has
+    labels = np.stack(list(masks_of(moving_scene, holes).labels))
+    whole = overlap(np.stack(list(moving_result.labels)), moving_scene.masks)
+    assert overlap(labels, moving_scene.masks) > whole - 0.1
+    assert (labels > 0)[moving_scene.masks == 0].mean() < 0.03
+    assert overlap(labels[4:5], moving_scene.masks[4:5]) > 0.6
+    with pytest.raises(InputError, match=r"none of \d+ tracks has depth"):
+        masks_of(moving_scene, np.full_like(depths, np.nan))
+
+
+def test_what_fills_most_of_the_image_is_the_world(moving_config: SyntheticSceneConfig) -> None:
+    # The room moves, too, as one piece: nobody could tell that from a moving camera.
+    scene = simulate(moving_config.model_copy(update={"objects": "all_dynamic", "num_frames": 10}))
+    result = masks_of(scene)
+    room = int(np.bincount(scene.masks.ravel()).argmax())
+    labels = np.stack(list(result.labels))
+    things = (scene.masks != room) & (scene.masks != 0)
+    assert overlap(labels, things) > 0.7
+    assert (labels > 0)[~things].mean() < 0.05
+
+
+def test_a_warning_when_everything_moves_its_own_way(static_scene: Simulation, rng: np.random.Generator) -> None:
+    tracks = static_scene.sequence.tracks
+    assert tracks is not None
+    wander = rng.normal(0, 3, tracks.uv.shape).cumsum(axis=1)
+    wandering = np.clip(tracks.uv + wander, 0, (159, 119)).astype(np.float32)
+    result = masks_of(static_scene, tracks=Tracks(wandering, tracks.visible, tracks.query_frame))
+    assert len(result.warnings) == 1
+    assert "most of the image seems to move" in result.warnings[0]
 
 
 def test_input_that_does_not_fit_and_a_stop_are_clear(static_scene: Simulation) -> None:

@@ -81,7 +81,7 @@ def motion_masks(
         solver: Stages 1 and 2 and their minimiser; None takes the defaults.
 
     Raises:
-        InputError: If depth or tracks do not fit the images.
+        InputError: If depth or tracks do not fit the images, or depth is missing wherever there is a track.
         DegenerateProblemError: If the tracks do not determine the cameras.
         SolverError: If the cameras cannot be solved.
         Cancelled: If ``should_stop`` turned true.
@@ -98,7 +98,6 @@ def motion_masks(
     comparison = _Comparison(video, depths, tracks, cameras, motion, config)
     labels = CompressedLabels(video.image_size)
     seen_in: dict[int, int] = {}
-    area = 0.0
     found = comparison.detections(stop)
     for frame, numbers in enumerate(associate_instances(found, video.images, config.instances, stop)):
         labels.append(numbers)
@@ -140,6 +139,11 @@ def _tracks_and_cameras(
 ) -> tuple[Cameras, TrackMotion]:
     """Solve cameras, test tracks, and do both once more without the tracks that move."""
     known = StaticTracks.of(video, depths, tracks, intrinsics, settings)
+    if not np.isfinite(known.labelled.depth).any():
+        raise InputError(
+            f"motion masks: none of {tracks.num_tracks} tracks has depth in any frame; give depth that is not missing, "
+            "or let it come from the motion of the camera"
+        )
     spread = spread_at_tracks(known.labelled.tracks, depths, max(1, round(config.depth_edge_px)))
     outlier = moving = find_outlier_tracks(known.labelled, intrinsics, config)
     cameras, motion = None, None
