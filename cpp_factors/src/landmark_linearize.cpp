@@ -74,6 +74,8 @@ UNI4D_FG_INLINE void add(double* sums, int place, const Pack& value) {
   store_pack(load_pack(at) + value, at);
 }
 
+constexpr std::size_t kGroupsAhead = 2;
+
 /// Where eight records put what they computed.
 struct Lanes {
   const RecordGroup& group;
@@ -90,6 +92,13 @@ UNI4D_FG_INLINE void store_coupling(const Lanes& lanes, const Pack* columns, int
     double* at = coupling + static_cast<std::size_t>(lanes.pair[lane]) * kWidth + row * kPackLanes;
     store_pack(lanes.group.first ? records[lane] : load_pack(at) + records[lane], at);
   }
+}
+
+/// Ask for the coupling blocks of records to come: they lie apart, where the processor does not foresee them.
+UNI4D_FG_INLINE void prefetch_coupling(const int* pair, const double* coupling) {
+  for (int lane = 0; lane < kPackLanes; ++lane)
+    for (int row = 0; row < 3; ++row)
+      prefetch_for_writing(coupling + static_cast<std::size_t>(pair[lane]) * kWidth + row * kPackLanes);
 }
 
 /// Add eight sums at place `row` of the records' landmarks.
@@ -113,6 +122,8 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
   const GroupArrays groups(chunk);
   for (std::size_t i = 0; i < groups.count; ++i) {
     const RecordGroup& group = groups.groups[i];
+    if (i + kGroupsAhead < groups.count && !chunk.frozen)
+      prefetch_coupling(groups.lane_pair + (i + kGroupsAhead) * kPackLanes, coupling);
     const double* data = groups.data + i * kFields * kPackLanes;
     const std::uint8_t* lane_landmark = groups.lane_landmark + i * kPackLanes;
     const double* m = in.state.world_T_cam + 16 * group.frame;

@@ -78,6 +78,14 @@ UNI4D_FG_INLINE Pack load_pack(const double* p) {
 
 UNI4D_FG_INLINE void store_pack(const Pack& a, double* p) { std::memcpy(p, &a, sizeof(Pack)); }
 
+UNI4D_FG_INLINE void prefetch_for_writing(const double* p) {
+#if defined(__GNUC__) || defined(__clang__)
+  __builtin_prefetch(p, 1, 3);
+#else
+  (void)p;
+#endif
+}
+
 /// Larger of two values per lane; b where a is NaN.
 UNI4D_FG_INLINE Pack larger(const Pack& a, const Pack& b) {
   Pack out;
