@@ -148,3 +148,43 @@ def test_cells_tile_the_image() -> None:
     uv = np.array([[0.0, 0.0], [79.0, 79.0], [81.0, 0.0], [0.0, 81.0], [639.0, 479.0], [-5.0, 900.0]])
     cells = image_cells(uv, np.array([500.0, 500.0, 319.5, 239.5]), 8)
     np.testing.assert_array_equal(cells, [0, 0, 8, 1, 7 * 8 + 6 - 1, 7])
+
+
+def test_held_landmarks_are_constants_whose_errors_a_cluster_shares() -> None:
+    """One camera before known points: about three neighbours share their error, so that it does not cancel."""
+    rng = np.random.default_rng(11)
+    problem, truth = problem_of(rng)
+    batches = []
+    for batch in problem.batches:
+        if "uv" in batch.data:
+            pose = next(s.rows for s in batch.slots if s.group == "pose")
+            batches.append(batch.take(np.flatnonzero(pose == 1)))
+    only = np.zeros((POSES, 6), dtype=bool)
+    only[1] = True
+    problem = Problem(tuple(batches), {"pose": only})
+    (reprojection,) = problem.batches
+    landmark = next(s.rows for s in reprojection.slots if s.group == "landmark")
+    # Strips of the image: what neighbours share does not cancel.
+    of_landmark = np.zeros(LANDMARKS, dtype=np.int64)
+    of_landmark[landmark[np.argsort(reprojection.data["uv"][:, 0])]] = (
+        np.arange(len(landmark)) * CLUSTERS // len(landmark)
+    )
+    clusters = Clusters(of_landmark, CLUSTERS)
+    samples, claimed, independent = [], [], []
+    for _ in range(DRAWS):
+        errors = rng.standard_normal((CLUSTERS, 2))[of_landmark[landmark]]
+        noisy = with_reprojection_errors(problem, truth, errors)
+        objective = SchurObjective(noisy, truth, CONFIG, None)
+        found, summary = minimize(objective, truth, CONFIG)
+        assert summary.converged
+        samples.append(twists(found, truth)[0])
+        for marginals, out in (
+            (clustered_marginals(noisy, found, CONFIG, clusters), claimed),
+            (camera_marginals(noisy, found, CONFIG, None), independent),
+        ):
+            assert marginals is not None
+            out.append(np.diag(marginals.blocks("pose", POSES)[1]))
+    variance = np.mean(np.square(samples), axis=0)
+    assert 0.7 < float(np.mean(np.mean(claimed, axis=0) / variance)) < 1.3
+    roll_and_depth = [2, 5]
+    assert float(np.mean((np.mean(independent, axis=0) / variance)[roll_and_depth])) < 0.6

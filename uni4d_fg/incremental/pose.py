@@ -12,8 +12,15 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 from uni4d_fg.graph.state import State
 from uni4d_fg.incremental.labels import LabelledFrame
+from uni4d_fg.solve.clustered import clustered_marginals
 from uni4d_fg.solve.marginals import camera_marginals
-from uni4d_fg.stages.bundle_adjustment import StaticNoise, depth_prior_terms, reprojection_residual, reprojection_term
+from uni4d_fg.stages.bundle_adjustment import (
+    StaticNoise,
+    depth_prior_terms,
+    reprojection_residual,
+    reprojection_term,
+    track_cells,
+)
 from uni4d_fg.stages.lifting import frame_log_scales
 from uni4d_fg.stages.observations import Observations
 from uni4d_fg.stages.stage import Stage, StageRunner
@@ -28,7 +35,7 @@ class FramePose:
     inlier: BoolArray
     """(n,) which of the observations agree with it."""
     covariance: FloatArray
-    """(6, 6) given the points; NaN if not determined."""
+    """(6, 6) given the points, with clusters of tracks that may err alike; NaN if not determined."""
 
 
 def predict(poses: FloatArray, frames: FloatArray, frame: float) -> FloatArray:
@@ -96,7 +103,12 @@ def locate(
             break
     assert best is not None
     state, inlier = best
-    marginals = camera_marginals(stage.problem, state, stage.solver, None)
+    clusters = track_cells(observations, intrinsics, ba)
+    marginals = (
+        camera_marginals(stage.problem, state, stage.solver, None)
+        if clusters is None
+        else clustered_marginals(stage.problem, state, stage.solver, clusters)
+    )
     covariance = np.full((6, 6), np.nan) if marginals is None else marginals.blocks("pose", 1)[0]
     return FramePose(state["pose"][0], float(state["log_scale"][0, 0]), inlier, covariance)
 

@@ -102,6 +102,7 @@ def gradient_spread(
     carried: Spread | None = None,
     *,
     as_prior: bool = False,
+    held: bool = False,
 ) -> Spread:
     """Return the spread of the reduced gradient on the columns of a layout.
 
@@ -115,10 +116,11 @@ def gradient_spread(
             by its information when None.
         as_prior: The spread that a linear prior made of these factors has. Its Hessian is that of reweighted least
             squares, and its minimum spreads by the curvature: the scores grow by the ratio of the two.
+        held: The landmarks are constants: nothing of them is eliminated.
     """
     scores, rest = np.zeros((clusters.count, layout.size)), np.zeros((layout.size, layout.size))
     on_landmarks = [batch for batch in batches if len(batch) and any(s.group == eliminate for s in batch.slots)]
-    ratio = _add_scores(scores, on_landmarks, state, layout, clusters, eliminate)
+    ratio = _add_scores(scores, on_landmarks, state, layout, clusters, eliminate, held)
     if as_prior:
         scores /= ratio
     for batch in batches:
@@ -158,7 +160,7 @@ def clustered_marginals(
         state: Its solution.
         config: Options of the solve.
         clusters: Of the landmarks.
-        eliminate: Group of the landmarks.
+        eliminate: Group of the landmarks; constants where the problem does not free them.
         carried: See :func:`gradient_spread`.
 
     Returns:
@@ -168,10 +170,11 @@ def clustered_marginals(
         SolverError: If a factor is not finite.
     """
     batches = tuple(curvature_batch(batch, state) for batch in problem.batches)
-    marginals = camera_marginals(Problem(batches, problem.free), state, config, eliminate)
+    held = eliminate not in problem.free
+    marginals = camera_marginals(Problem(batches, problem.free), state, config, None if held else eliminate)
     if marginals is None:
         return None
-    spread = gradient_spread(problem.batches, state, marginals.layout, clusters, eliminate, carried)
+    spread = gradient_spread(problem.batches, state, marginals.layout, clusters, eliminate, carried, held=held)
     if spread.num_used < MIN_CLUSTERS:
         return marginals
     inverse = marginals.covariance
@@ -196,8 +199,9 @@ def _add_scores(
     layout: DenseLayout,
     clusters: Clusters,
     eliminate: str,
+    held: bool,
 ) -> float:
-    """Add ``J_c^T (w r - p J_l V^{-1} g_l)`` of every row to the score of its landmark's cluster.
+    """Add ``J_c^T (w r - p J_l V^{-1} g_l)`` of every row to the score of its landmark's cluster; of held ones ``w r``.
 
     Returns the ratio of the rows' curvature to their weights.
     """
@@ -222,7 +226,9 @@ def _add_scores(
         for a in range(3):
             gradient[:, a] += np.bincount(landmark, slope[:, a], count)
         rows.append((batch, at, landmark, r, jacobians, curved))
-    step = (np.linalg.pinv(hessian.reshape(-1, 3, 3), hermitian=True) @ gradient[:, :, None])[:, :, 0]
+    step = np.zeros((count, 3))
+    if not held:
+        step = (np.linalg.pinv(hessian.reshape(-1, 3, 3), hermitian=True) @ gradient[:, :, None])[:, :, 0]
     for batch, at, landmark, r, jacobians, curved in rows:
         pull = r - curved[:, None] * np.einsum("nda,na->nd", jacobians[at], step[landmark])
         start = clusters.of_landmark[landmark] * layout.size
