@@ -1,7 +1,7 @@
 """Every entry point of the extension that takes arrays, with valid arguments to start from.
 
 An entry is a function of named arguments and a maker of valid ones. `test_boundary.py` spoils one argument at a
-time; a new entry point is covered by adding a line here.
+time; a new entry point is covered by adding a line here. `LandmarkSystem` has tests of the same kind of its own.
 """
 
 from __future__ import annotations
@@ -71,3 +71,36 @@ ENTRY_POINTS["PairSystem"] = EntryPoint(
 )
 ENTRY_POINTS["PairSystem.energy"] = EntryPoint(_PAIR_SYSTEM.energy, _state_of_pairs)
 ENTRY_POINTS["PairSystem.linearize"] = EntryPoint(_PAIR_SYSTEM.linearize, _state_of_pairs)
+
+
+def _trajectory(method: str, slots: int, fields: dict[str, tuple[int, ...]]) -> EntryPoint:
+    """Return the entry of one kind of batch on a system of three tracks; rows stand as "rows[0]", "rows[1]", ..."""
+
+    def call(**arguments: Any) -> None:
+        rows = [arguments.pop(f"rows[{i}]") for i in range(slots)]
+        getattr(_core.TrajectorySystem(np.repeat(np.arange(3), 5)), method)(rows=rows, **arguments)
+
+    def make(rng: np.random.Generator) -> dict[str, Any]:
+        data = {name: rng.uniform(1, 5, (4, *shape)) for name, shape in fields.items()}
+        return {**{f"rows[{i}]": np.arange(4) + i for i in range(slots)}, **data, **_noise(rng, 4)}
+
+    return EntryPoint(call, make, ("sigma", "weight", *(["depth"] if "depth" in fields else [])))
+
+
+_CAMERA = {"world_T_cam": (4, 4)}
+_TRAJECTORIES = _core.TrajectorySystem(np.repeat(np.arange(3), 5))
+_TRAJECTORIES.plan()
+_TRAJECTORIES.linearize(np.zeros((15, 3)))
+
+ENTRY_POINTS |= {
+    f"TrajectorySystem.{name}": entry
+    for name, entry in {
+        "add_dynamic_reprojection": _trajectory(
+            "add_dynamic_reprojection", 1, {"uv": (2,), **_CAMERA, "intrinsics": (4,)}
+        ),
+        "add_dynamic_depth_prior": _trajectory("add_dynamic_depth_prior", 1, {"depth": (), **_CAMERA, "log_scale": ()}),
+        "add_smoothness": _trajectory("add_smoothness", 3, {}),
+        "add_arap": _trajectory("add_arap", 4, {}),
+        "multiply": EntryPoint(_TRAJECTORIES.multiply, lambda rng: {"vector": rng.normal(size=45)}),
+    }.items()
+}
