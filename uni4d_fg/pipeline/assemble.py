@@ -83,8 +83,10 @@ def write_views(
     reconstruction: Reconstruction,
     config: Config,
     should_stop: Callable[[], bool],
+    *,
+    unit: str = "m",
 ) -> None:
-    """Write clouds and pictures, as the config asks, instead of those of an earlier result.
+    """Write clouds and pictures, as the config asks, instead of those of an earlier result; lengths are in ``unit``.
 
     Raises:
         Cancelled: If ``should_stop`` said so.
@@ -102,8 +104,8 @@ def write_views(
         write_clouds(folder, static, _until(should_stop, moving))
     _check(should_stop)
     if config.output.pictures:
-        draw_trajectory(folder.trajectory_picture, poses, sequence.ground_truth.world_T_cam)
-        draw_depth_strip(folder.depth_picture, sequence.images, sequence.depths, depth)
+        draw_trajectory(folder.trajectory_picture, poses, sequence.ground_truth.world_T_cam, unit=unit)
+        draw_depth_strip(folder.depth_picture, sequence.images, sequence.depths, depth, unit=unit)
 
         def dynamic(frame: int) -> tuple[np.ndarray, ImageArray]:
             return dynamic_cloud(

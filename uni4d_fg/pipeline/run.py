@@ -158,7 +158,8 @@ def reconstruct(
     write_result(folder, reconstruction)
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
-    write_views(folder, sequence, reconstruction, config, run.should_stop)
+    unit = "m" if summary.cues.get("metric", True) else "scale unknown"
+    write_views(folder, sequence, reconstruction, config, run.should_stop, unit=unit)
     run.reporter.end()
     run._note("output", {}, time.perf_counter() - began, False)
     atomic_write_json(folder.summary, summary.to_dict())

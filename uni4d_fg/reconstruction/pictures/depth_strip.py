@@ -26,6 +26,7 @@ def draw_depth_strip(
     fused: FrameSource[Float32Array],
     *,
     columns: int = 5,
+    unit: str = "m",
 ) -> None:
     """Draw a few frames as PNG, in columns: image, depth cue, fused depth, and the change between the two.
 
@@ -37,6 +38,7 @@ def draw_depth_strip(
         cue: T maps (H, W), metres, NaN where missing.
         fused: T maps (H, W), metres, NaN where missing.
         columns: Number of frames shown, evenly spread.
+        unit: Name of the unit of depth.
 
     Raises:
         OutputError: If the file cannot be written.
@@ -69,7 +71,7 @@ def draw_depth_strip(
         grid[row, 0].set_ylabel(name, fontsize=10, color=INK)
     bar = figure.colorbar(shown[0], ax=list(grid[1:3].ravel()), pad=0.01, aspect=30)
     _label_depths(bar.ax, depth_norm)
-    bar.set_label("depth [m]", fontsize=9, color=INK)
+    bar.set_label(f"depth [{unit}]", fontsize=9, color=INK)
     bar_change = figure.colorbar(shown[1], ax=list(grid[3]), pad=0.01, aspect=15)
     bar_change.set_label("fused / cue [%]", fontsize=9, color=INK)
     for axis in (bar.ax, bar_change.ax):

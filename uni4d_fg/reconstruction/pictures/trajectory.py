@@ -18,14 +18,17 @@ _MIN_EXTENT_M = 0.02
 _VIEW_ARROWS = 16
 
 
-def draw_trajectory(path: Path, world_T_cam: FloatArray, ground_truth: FloatArray | None = None) -> None:
-    """Draw the camera path as PNG: top view and side view, metres, equal axes.
+def draw_trajectory(
+    path: Path, world_T_cam: FloatArray, ground_truth: FloatArray | None = None, *, unit: str = "m"
+) -> None:
+    """Draw the camera path as PNG: top view and side view, equal axes.
 
     Args:
         path: The ``.png`` file.
-        world_T_cam: (T, 4, 4) estimated camera to world, metres.
+        world_T_cam: (T, 4, 4) estimated camera to world.
         ground_truth: (T, 4, 4) true poses, NaN where unknown; if given, the estimate is first aligned to
             them with Sim(3), and the errors stand in the title.
+        unit: Name of the estimate's unit of length; after alignment it is the truth's, metres.
 
     Raises:
         OutputError: If the file cannot be written.
@@ -34,7 +37,7 @@ def draw_trajectory(path: Path, world_T_cam: FloatArray, ground_truth: FloatArra
     if ground_truth is not None:
         known = np.asarray(np.isfinite(ground_truth).all(axis=(1, 2)))
         if known.sum() > 0:
-            truth = ground_truth[known]
+            truth, unit = ground_truth[known], "m"
             poses = align_trajectories(world_T_cam[known], truth).apply_poses(world_T_cam)
             metrics = evaluate_trajectory(world_T_cam[known], truth)
             title = f"Camera path   ATE {metrics.ate_m:.4f} m"
@@ -52,7 +55,8 @@ def draw_trajectory(path: Path, world_T_cam: FloatArray, ground_truth: FloatArra
     everything = estimate if reference is None else np.concatenate((estimate, reference))
     centre = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     half = 0.58 * max(float(np.ptp(everything, axis=0).max()), _MIN_EXTENT_M)
-    panels = (("Top view", 0, 1, "right [m]", "forward [m]"), ("Side view", 1, 2, "forward [m]", "up [m]"))
+    right, forward, up = (f"{axis} [{unit}]" for axis in ("right", "forward", "up"))
+    panels = (("Top view", 0, 1, right, forward), ("Side view", 1, 2, forward, up))
     lines = None
     for column, (name, i, j, label_x, label_y) in enumerate(panels):
         panel = figure.add_subplot(1, 2, column + 1)
