@@ -103,14 +103,26 @@ def locate(
             break
     assert best is not None
     state, inlier = best
+    marginals = camera_marginals(stage.problem, state, stage.solver, None)
+    if marginals is None:
+        return FramePose(state["pose"][0], float(state["log_scale"][0, 0]), inlier, np.full((6, 6), np.nan))
+    covariance = marginals.blocks("pose", 1)[0]
     clusters = track_cells(observations, intrinsics, ba)
-    marginals = (
-        camera_marginals(stage.problem, state, stage.solver, None)
-        if clusters is None
-        else clustered_marginals(stage.problem, state, stage.solver, clusters)
-    )
-    covariance = np.full((6, 6), np.nan) if marginals is None else marginals.blocks("pose", 1)[0]
+    shared = None if clusters is None else clustered_marginals(stage.problem, state, stage.solver, clusters)
+    if shared is not None:
+        # The points are uncertain too, and cells are few: neither figure is trusted where it is the smaller one.
+        covariance = larger_covariance(covariance, shared.blocks("pose", 1)[0])
     return FramePose(state["pose"][0], float(state["log_scale"][0, 0]), inlier, covariance)
+
+
+def larger_covariance(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the smallest covariance (n, n) that, on the axes the two share, is at least as large as either."""
+    root = np.linalg.cholesky(first)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, second).T)
+    values, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    factor = root @ (axes * np.sqrt(np.maximum(values, 1.0)))
+    result: FloatArray = factor @ factor.T
+    return result
 
 
 def composed_covariance(reference: FloatArray, reference_T_cam: FloatArray, relative: FloatArray) -> FloatArray:
