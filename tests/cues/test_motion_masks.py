@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.cues.appearance import frame_appearance, moved_evidence
 from uni4d_fg.cues.depth_range import UNKNOWN_RANGE, depth_range
 from uni4d_fg.cues.guided_filter import guided_filter
 from uni4d_fg.cues.motion_masks import MotionMasks, motion_masks
@@ -112,6 +114,39 @@ def test_the_guided_filter_keeps_the_edges_of_its_guide(rng: np.random.Generator
     assert np.abs(smooth - truth).mean() < 0.1
 
 
+def test_evidence_of_pixels(rng: np.random.Generator) -> None:
+    noise = cv2.GaussianBlur(rng.uniform(0, 255, (120, 160, 3)).astype(np.float32), (0, 0), 2)
+    image = np.clip(128 + 4 * (noise - noise.mean()), 0, 255).astype(np.uint8)
+    image[90:] = 100
+    after = image.copy()
+    after[20:50, 28:58] = image[20:50, 20:50]  # moved by 8 px
+    near = np.full((120, 160), 2.0, np.float32)
+    near[20:60, 100:140] = 1.0  # something else in front
+    zero = np.zeros((120, 160), np.float32)
+
+    def evidence(second: np.ndarray, depth: np.ndarray, pose: np.ndarray, edge_px: int = 1) -> np.ndarray:
+        first, other = (frame_appearance(i, d, 0.0, edge_px) for i, d in ((image, depth), (second, near)))
+        return moved_evidence(first, other, pose, INTRINSICS, (zero, zero), MotionMaskConfig())
+
+    far = np.full((120, 160), 2.0, np.float32)
+    found = evidence(after, far, np.eye(4))
+    assert found[25:45, 33:53].mean() > 1.0
+    assert found[5:15].mean() < -0.2
+    assert found[60:80].mean() < -0.2
+    assert (found[25:55, 105:135] == 0).all()  # hidden
+    assert np.abs(found[100:]).max() < 0.1  # nothing to see
+    # The camera moved by 8 px of parallax at 2 m. Where depth says 1 m it contradicts, unless depth varies there.
+    pose, wrong = np.eye(4), far.copy()
+    pose[0, 3] = 8 * 2.0 / INTRINSICS[0]
+    wrong[60:85] = 1.0
+    shifted = np.roll(image, 8, axis=1)
+    band = np.s_[66:79, 40:130]
+    assert evidence(shifted, far, pose)[band].mean() < -0.2
+    assert evidence(shifted, wrong, pose)[band].mean() > 0.5
+    wrong[60:85, ::6] = 2.0
+    assert evidence(shifted, wrong, pose, 7)[band].mean() < 0.1
+
+
 def labelled_scene(rng: np.random.Generator, poses: np.ndarray) -> tuple[LabelledTracks, np.ndarray]:
     """300 static points and 60 that drift by 3 cm per frame, seen by cameras with known poses."""
     count, frames = 360, len(poses)
@@ -142,6 +177,11 @@ def test_tracks_that_move_are_told_from_those_that_do_not(rng: np.random.Generat
     assert found.static[~moves].mean() > 0.95
     assert not (found.static & moves).any()
     assert found.moving[~moves].mean() < 0.02
+    # What all tracks share is an error of the cameras: here, poses that are turned by about 2 px.
+    turned = poses @ np.stack([se3.se3_exp(np.append(rng.normal(0, 0.01, 3), (0, 0, 0))) for _ in poses])
+    found = find_moving_tracks(labelled, spread, Cameras(turned, INTRINSICS, np.zeros(10)), (120, 160), config)
+    assert found.static[~moves].mean() > 0.8
+    assert found.moving[moves].mean() > 0.7
 
 
 def test_depth_may_be_wrong_where_it_varies_and_motion_across_the_epipolar_line_still_counts(
