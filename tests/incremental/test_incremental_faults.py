@@ -42,17 +42,31 @@ def test_dropped_frames_are_bridged_by_their_tracks(gap: int) -> None:
     solver, updates = feed(sequence, frames=kept)
     assert all(update.status is not FrameStatus.BRIDGED for update in updates)
     truth = true_poses(sequence)
-    assert ate(solver.finish().world_T_cam, truth[kept]) < 0.03 * path_length(truth)
+    assert ate(solver.finish().world_T_cam, truth[kept]) < 0.015 * path_length(truth)
 
 
-def test_frames_without_depth_do_no_harm() -> None:
+@pytest.mark.parametrize("missing", [range(10, 16), range(12, FRAMES)])
+def test_frames_without_depth_do_no_harm(missing: range) -> None:
     sequence = stream(FRAMES)
     nothing = np.full(sequence.image_size, np.nan, dtype=np.float32)
-    solver, _ = feed(sequence, depth=lambda t: nothing if 10 <= t < 16 else sequence.depths[t])
+    solver, updates = feed(sequence, depth=lambda t: nothing if t in missing else sequence.depths[t])
+    assert all(update.status is not FrameStatus.BRIDGED for update in updates)
     truth = true_poses(sequence)
     result = solver.finish()
+    assert result.pose_covariance is not None
     assert np.isfinite(result.world_T_cam).all()
-    assert ate(result.world_T_cam, truth) < 0.03 * path_length(truth)
+    assert np.isfinite(result.pose_covariance).all()
+    assert ate(result.world_T_cam, truth) < 0.015 * path_length(truth)
+
+
+def test_a_stream_that_begins_without_depth_begins_where_depth_does() -> None:
+    sequence = stream(FRAMES)
+    nothing = np.full(sequence.image_size, np.nan, dtype=np.float32)
+    solver, updates = feed(sequence, frames=list(range(20)), depth=lambda t: nothing if t < 3 else sequence.depths[t])
+    assert all(update.status is FrameStatus.BRIDGED for update in updates[1:4])
+    assert all(update.status is not FrameStatus.BRIDGED for update in updates[4:])
+    truth = true_poses(sequence)[3:20]
+    assert ate(solver.finish().world_T_cam[3:], truth) < 0.03 * path_length(truth)
 
 
 def renumbered(tracks: FrameTracks) -> FrameTracks:
