@@ -12,7 +12,7 @@ import pytest
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.appearance import frame_appearance, moved_evidence
-from uni4d_fg.cues.depth_range import UNKNOWN_RANGE, depth_range
+from uni4d_fg.cues.depth_range import UNKNOWN_RANGE, depth_range, spread_at_tracks
 from uni4d_fg.cues.guided_filter import guided_filter
 from uni4d_fg.cues.motion_masks import MotionMasks, motion_masks
 from uni4d_fg.cues.moving_regions import trusted_components
@@ -103,6 +103,8 @@ def test_depth_range_knows_edges_and_holes() -> None:
     assert bool(around.known[5, 5])
     assert not around.known[10, 28]
     assert np.isfinite(around.log_depth).all()
+    tracks = Tracks(np.array([[[10, 10]], [[14, 10]]], np.float32), np.ones((2, 1), bool), np.zeros(2, np.int32))
+    np.testing.assert_allclose(spread_at_tracks(tracks, ArrayFrames(depth[None]), 3), [[0], [np.log(2)]], atol=1e-6)
 
 
 def test_the_guided_filter_keeps_the_edges_of_its_guide(rng: np.random.Generator) -> None:
