@@ -2,8 +2,8 @@
 
     python benchmarks/streaming.py [--frames 1000 3000] [--new-tracks 400] [--set FIELD=VALUE ...]
 
-Every run is a process of its own. Frames (640 x 480, 400 new tracks every 10 frames, each at most 50 frames old; with 700
-about 2,000 are alive) are made one by one and forgotten; results are handed to a counter that keeps the poses only.
+Every run is a process of its own. Frames (640 x 480, 400 new tracks every 10 frames, each at most 50 frames old; with
+700 about 2,000 are alive) are made one by one and forgotten; results are handed to a counter that keeps the poses only.
 Time is the processor time of ``add_frame`` alone, with tracks given, so that other work on the machine does not count;
 the time of its parts is that of a clock. Memory is the resident size after each frame. Printed as Markdown.
 """
