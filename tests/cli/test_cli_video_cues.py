@@ -30,18 +30,6 @@ QUICK = ["--config", "fast", "--quiet", "--set", "output.pictures=false", "--set
 SCENE = SyntheticSceneConfig(num_frames=10, width=160, height=120, focal=150.0, frame_rate=5.0, objects="none")
 
 
-@pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str]) -> Run:
-    def run(*words: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = main.run([str(word) for word in words])
-        out, err = capsys.readouterr()
-        assert "Traceback" not in err
-        return code, out, err
-
-    return run
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sequence folder, and clip.mp4 of its frames beside it."""

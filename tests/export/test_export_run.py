@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from uni4d_fg.cli import main
 from uni4d_fg.errors import Cancelled, InputError, OutputError
 from uni4d_fg.export import export_run
 from uni4d_fg.export import run as export_module
@@ -24,18 +23,6 @@ from uni4d_fg.sequence.frames import ImageFolder
 from uni4d_fg.sequence.model import ArrayFrames
 
 Cli = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
-    def run(*words: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = main.run([str(word) for word in words])
-        out, err = capsys.readouterr()
-        assert "Traceback" not in err
-        return code, out, err
-
-    return run
 
 
 def names(folder: Path) -> list[str]:

@@ -6,6 +6,7 @@ lies at ``(u + 0.5) s - 0.5`` of the small one, where ``s`` is the ratio of the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -54,40 +55,21 @@ def resize_nearest(array: T, size: tuple[int, int]) -> T:
     return array[np.ix_(rows, columns)]  # type: ignore[return-value]
 
 
-class ResizedImages(LazyFrames[ImageArray]):
-    """Images made smaller as they are read.
+class ResizedFrames(LazyFrames[T]):
+    """Images or maps whose size is changed as they are read.
 
     Args:
-        source: T images (H, W, 3).
+        source: T images (H, W, 3) or maps (H, W).
         size: New (height, width), px.
+        resize: Makes one frame of that size.
     """
 
-    def __init__(self, source: FrameSource[ImageArray], size: tuple[int, int]) -> None:
+    def __init__(
+        self, source: FrameSource[T], size: tuple[int, int], resize: Callable[[T, tuple[int, int]], T]
+    ) -> None:
         self.source = source
         self.size = size
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def where(self, frame: int) -> str:
-        """Return where the source has it from."""
-        return where_of(self.source, frame)
-
-    def _read(self, frame: int) -> ImageArray:
-        return resize_image(self.source[frame], self.size)
-
-
-class ResizedMaps(LazyFrames[T]):
-    """Depth or label maps whose size is changed as they are read, without mixing values.
-
-    Args:
-        source: T maps (H, W).
-        size: New (height, width), px.
-    """
-
-    def __init__(self, source: FrameSource[T], size: tuple[int, int]) -> None:
-        self.source = source
-        self.size = size
+        self.resize = resize
 
     def __len__(self) -> int:
         return len(self.source)
@@ -97,7 +79,11 @@ class ResizedMaps(LazyFrames[T]):
         return where_of(self.source, frame)
 
     def _read(self, frame: int) -> T:
-        return resize_nearest(self.source[frame], self.size)
+        return self.resize(self.source[frame], self.size)
+
+
+def _maps(source: FrameSource[T] | None, size: tuple[int, int]) -> FrameSource[T] | None:
+    return None if source is None else ResizedFrames(source, size, resize_nearest)
 
 
 def resize_video(video: Video, max_size: int) -> Video:
@@ -112,15 +98,15 @@ def resize_video(video: Video, max_size: int) -> Video:
     truth = video.ground_truth
     return replace(
         video,
-        images=ResizedImages(video.images, new_size),
+        images=ResizedFrames(video.images, new_size, resize_image),
         image_size=new_size,
-        depths=None if video.depths is None else ResizedMaps(video.depths, new_size),
-        masks=None if video.masks is None else ResizedMaps(video.masks, new_size),
+        depths=_maps(video.depths, new_size),
+        masks=_maps(video.masks, new_size),
         intrinsics=None if video.intrinsics is None else scale_intrinsics(video.intrinsics, size, new_size),
         tracks=None if video.tracks is None else resize_tracks(video.tracks, size, new_size),
         ground_truth=replace(
             truth,
-            depths=None if truth.depths is None else ResizedMaps(truth.depths, new_size),
+            depths=_maps(truth.depths, new_size),
             intrinsics=None if truth.intrinsics is None else scale_intrinsics(truth.intrinsics, size, new_size),
         ),
     )
