@@ -11,12 +11,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from stream_samples import stream, stream_config
+from stream_samples import feed, stream, stream_config
 from typer.testing import CliRunner
 
 from uni4d_fg.cli.main import app
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.evaluate.tum import read_tum
+from uni4d_fg.incremental import IncrementalReconstructor
+from uni4d_fg.incremental.checkpoint import restore, state_arrays
 from uni4d_fg.incremental.stream import stream_sequence
 from uni4d_fg.reconstruction.io import load_reconstruction
 from uni4d_fg.sequence.write import write_native
@@ -136,3 +138,18 @@ def test_the_verb_on_a_bare_video(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*words, "--depth", str(depth)])
     assert result.exit_code == 0, result.output
     assert load_reconstruction(tmp_path / "run" / "reconstruction.npz").num_frames == 8
+
+
+def test_a_restored_state_is_the_stored_one_in_every_array() -> None:
+    solver, _ = feed(stream(FRAMES), CONFIG, frames=list(range(12)))
+    stored = state_arrays(solver)
+    sequence = stream(FRAMES)
+    again = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, CONFIG)
+    restore(again, stored)
+    found = state_arrays(again)
+    assert found.keys() == stored.keys()
+    for name, array in stored.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    del stored["window_noise"]
+    with pytest.raises(InputError, match="damaged"):
+        restore(again, stored)
