@@ -98,7 +98,12 @@ def test_the_panel_drives_the_scene(finished_run: Path, capsys: pytest.CaptureFi
 def test_it_serves_this_machine_only_and_ctrl_c_ends_it_with_0(finished_run: Path) -> None:
     port = free_port()
     command = [sys.executable, "-m", "uni4d_fg.cli.main", "view", str(finished_run), "--port", str(port)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # As a shell starts a background job: deaf to Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == f"room: http://127.0.0.1:{port} (Ctrl-C ends)\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,7 +28,8 @@ def view(
     from uni4d_fg.view.server import viewer_server
     from uni4d_fg.view.viewer import Viewer
 
-    # Ctrl-C is how a viewer is closed, so that it is no failure.
+    # Ctrl-C is how a viewer is closed, so that it is no failure; a shell's background job is started deaf to it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt):
         opened = _open(run)
         with viewer_server(host, port, f"uni4d-fg: {opened.name}") as server:
