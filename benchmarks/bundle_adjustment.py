@@ -12,8 +12,8 @@ Huber's kernel at 1.345 px, first and last pose fixed. Every solver stops when a
     gtsam         gtsam.LevenbergMarquardtOptimizer on GeneralSFMFactor2Cal3_S2, landmarks first in the ordering,
                   its default parameters; its calibration has a skew, held at 0 by a prior, and the fixed poses are
                   held by priors of 1e-6. Building the graph from Python is not counted
-    ceres         pycolmap's bundle adjuster on a PINHOLE camera, SPARSE_SCHUR and DENSE_SCHUR (pip install pyceres
-                  pycolmap); Ceres' own times, its preprocessing as 'set up'; building the problem is not counted
+    ceres         pycolmap's bundle adjuster on a PINHOLE camera, SPARSE_SCHUR and DENSE_SCHUR (both come with
+                  the extra 'dev'); Ceres' own times, its preprocessing as 'set up'; building the problem is not counted
 
 With --bal the problems are files in the format of "Bundle Adjustment in the Large" (text, .bz2 or .gz) in place of the
 synthetic sizes. Their cameras have a focal length and two radial distortion coefficients each; here all share one
