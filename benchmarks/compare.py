@@ -32,8 +32,8 @@ from uni4d_fg.progress import SilentReporter
 
 BASELINE = Path(__file__).with_name("compare_baseline.json")
 QUIET = ("output.clouds=false", "output.pictures=false")
-TOLERANCE = {"time": 2.0, "energy": 1.0005, "accuracy": 1.25}
-"""Factors by which a ratio may exceed the baseline's: timings of small solves vary by two on a shared machine."""
+TOLERANCE = {"time": 3.0, "energy": 1.0005, "accuracy": 1.25}
+"""Factors by which a ratio may exceed the baseline's: timings of small solves varied by 2.7 on a shared machine."""
 
 
 class LineReporter(SilentReporter):
