@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
-from uni4d_fg.evaluate.alignment import align_trajectories
+from uni4d_fg.evaluate.trajectory import evaluate_trajectory
 from uni4d_fg.factors.linear_prior import se3_log
 from uni4d_fg.geometry import se3
 from uni4d_fg.reconstruction.io import load_reconstruction
@@ -24,13 +23,6 @@ from uni4d_fg.reconstruction.model import Reconstruction
 from uni4d_fg.sequence.read import read_sequence
 
 _JOINT_LIMIT = 20.06
-
-
-def ate_and_scale(found: FloatArray, truth: FloatArray) -> tuple[float, float]:
-    """Return the ATE in metres and the scale (true / found) of the similarity that aligns the paths."""
-    similarity = align_trajectories(found, truth)
-    moved = similarity.scale * found[:, :3, 3] @ similarity.rotation.T + similarity.translation
-    return float(np.sqrt(np.mean(np.sum((moved - truth[:, :3, 3]) ** 2, axis=1)))), similarity.scale
 
 
 def agreement(run: Reconstruction, batch: Reconstruction) -> dict[str, float]:
@@ -72,15 +64,15 @@ def main() -> None:
     if truth is None:
         raise SystemExit(f"{arguments.sequence} has no true poses")
     batch = load_reconstruction(arguments.batch / "reconstruction.npz")
-    reference, scale = ate_and_scale(batch.world_T_cam, truth)
-    print(f"batch: ATE {1e3 * reference:.2f} mm, scale {scale:.3f}, fx {batch.intrinsics[0]:.1f} px")
+    reference = evaluate_trajectory(batch.world_T_cam, truth)
+    print(f"batch: ATE {1e3 * reference.ate_m:.2f} mm, scale {reference.scale:.3f}, fx {batch.intrinsics[0]:.1f} px")
     columns = []
     for folder in arguments.runs:
         run = load_reconstruction(folder / "reconstruction.npz")
-        ate, scale = ate_and_scale(run.world_T_cam, truth)
+        score = evaluate_trajectory(run.world_T_cam, truth)
         columns.append(
-            {"ATE, mm": 1e3 * ate, "ATE / batch": ate / reference, "scale (true / found)": scale}
-            | {"fx, px": float(run.intrinsics[0])} | agreement(run, batch)
+            {"ATE, mm": 1e3 * score.ate_m, "ATE / batch": score.ate_m / reference.ate_m}
+            | {"scale (true / found)": score.scale, "fx, px": float(run.intrinsics[0])} | agreement(run, batch)
         )  # fmt: skip
     print("| | " + " | ".join(folder.name for folder in arguments.runs) + " |")
     print("|---|" + "---|" * len(columns))

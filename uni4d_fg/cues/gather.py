@@ -112,15 +112,13 @@ class _Gathering:
                 depths = self._scaled_by_motion(network, masks)
         if plan.keep_built_in_tracks:
             self._any_tracks()
-        intrinsics = self.intrinsics
-        if intrinsics is None:
-            intrinsics = guess_intrinsics(self.video.image_size)
+        if self.intrinsics is None:
             report.sources["intrinsics"] = "guessed from the image size"
         report.facts += self.motion_facts
         report.warnings[:0] = self.motion_warnings
         sequence = as_sequence(
             replace(
-                self.video, depths=depths, masks=masks, intrinsics=intrinsics, tracks=self.tracks,
+                self.video, depths=depths, masks=masks, intrinsics=self._start_intrinsics(), tracks=self.tracks,
                 initial_world_T_cam=self.world_T_cam,
             )
         )  # fmt: skip
@@ -175,10 +173,9 @@ class _Gathering:
         video, plan, report = self.video, self.plan, self.report
         assert plan.depth_model is not None
         known = self.intrinsics is not None
-        intrinsics = guess_intrinsics(video.image_size) if self.intrinsics is None else self.intrinsics
+        focal = float(self._start_intrinsics()[0])
         found = network_depth(
-            video, plan.depth_model, float(intrinsics[0]), known, self.folder, self.config.networks, self.reporter,
-            self.should_stop,
+            video, plan.depth_model, focal, known, self.folder, self.config.networks, self.reporter, self.should_stop,
         )  # fmt: skip
         report.sources["depth"] = found.title
         if found.assumed_focal:
@@ -203,10 +200,9 @@ class _Gathering:
         """Return depth up to scale: from camera motion alone, or a network's relative depth scaled by it."""
         tracks, video, report = self._any_tracks(), self.video, self.report
         static = np.ones(tracks.num_tracks, bool) if masks is None else static_tracks(tracks, masks)
-        start = guess_intrinsics(video.image_size) if self.intrinsics is None else self.intrinsics
         found = geometric_depth(
-            replace(video, masks=masks), tracks, static, start, self._key(), self.folder, self.config, self.reporter,
-            self.should_stop,
+            replace(video, masks=masks), tracks, static, self._start_intrinsics(), self._key(), self.folder,
+            self.config, self.reporter, self.should_stop,
         )  # fmt: skip
         report.metric = False
         self.intrinsics = found.intrinsics
@@ -228,14 +224,17 @@ class _Gathering:
 
     def _motion_masks(self, depths: FrameSource[Float32Array]) -> FrameSource[Int32Array]:
         tracks = self._any_tracks()
-        start = guess_intrinsics(self.video.image_size) if self.intrinsics is None else self.intrinsics
         masks, facts, warnings = moving_masks(
-            self.video, depths, tracks, start, self._key(), _name_of(depths), self.folder, self.config, self.reporter,
-            self.should_stop,
+            self.video, depths, tracks, self._start_intrinsics(), self._key(), _name_of(depths), self.folder,
+            self.config, self.reporter, self.should_stop,
         )  # fmt: skip
         self.report.facts += [f"masks: {fact}" for fact in facts]
         self.report.warnings += warnings
         return masks
+
+    def _start_intrinsics(self) -> FloatArray:
+        """Return what is known of the intrinsics so far, (4,) px; a guess where that is nothing."""
+        return guess_intrinsics(self.video.image_size) if self.intrinsics is None else self.intrinsics
 
     def _key(self) -> str:
         if self._video_key is None:

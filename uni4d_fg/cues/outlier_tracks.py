@@ -14,6 +14,7 @@ from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static
 from uni4d_fg.geometry.camera import unproject
+from uni4d_fg.sequence.calibration import intrinsics_matrix
 from uni4d_fg.tracks.model import LabelledTracks
 
 _MIN_TRACKS = 12
@@ -53,8 +54,7 @@ def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config
 def _majority_pose(points: FloatArray, uv: FloatArray, intrinsics: FloatArray, threshold: float) -> FloatArray | None:
     """Return the pose (4, 4) of the points' camera in the one that sees them at ``uv``; None if none is found."""
     thin = np.linspace(0, len(points) - 1, min(len(points), _MAX_TRACKS)).astype(np.int64)
-    fx, fy, cx, cy = intrinsics
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    matrix = intrinsics_matrix(intrinsics)
     try:
         found, rotation, translation, _ = cv2.solvePnPRansac(
             points[thin], uv[thin], matrix, np.zeros(4), None, None, False, _ITERATIONS, threshold, 0.999

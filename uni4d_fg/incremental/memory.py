@@ -2,7 +2,7 @@
 
 Every frame allocates and frees arrays of many sizes. glibc keeps what was freed in its heap, whose top a few small
 arrays that live on hold up: the process grows over the first few hundred frames to a size that depends on the order of
-things, not on what it holds. Trimming now and then keeps the size at what is held.
+things, not on what it holds. Trimming after every frame keeps the size at what is held.
 """
 
 from __future__ import annotations

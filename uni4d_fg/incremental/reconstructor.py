@@ -26,9 +26,6 @@ from uni4d_fg.solve.backend import choose_backend
 from uni4d_fg.stages.bundle_adjustment import StaticNoise
 from uni4d_fg.stages.stage import LevenbergMarquardtRunner
 
-_TRIM_INTERVAL = 1
-"""Frames after which freed memory is given back."""
-
 
 @dataclass
 class PendingFrame:
@@ -158,8 +155,7 @@ class IncrementalReconstructor:
         finished = tuple(f for keyframe in left for f in self._finish_keyframe(*keyframe))
         self._forget(frame)
         self.results.add(finished, tuple(landmarks))
-        if frame % _TRIM_INTERVAL == 0:
-            return_free_memory()
+        return_free_memory()
         return self._update(status, dynamic, used, finished, tuple(landmarks))
 
     def finish(self) -> Reconstruction:

@@ -38,17 +38,29 @@ _MAX_DEPARTURE = 0.15
 """A median |log z - log cue| of moving points above this is warned of."""
 
 
+def given_poses(sequence: Sequence, config: Config) -> FloatArray | None:
+    """Return the poses (T, 4, 4) that the configuration takes from the sequence; None where they are estimated.
+
+    Raises:
+        InputError: If the sequence brings none.
+    """
+    if config.input.poses == "estimate":
+        return None
+    if sequence.initial_world_T_cam is None:
+        raise InputError(
+            f"input.poses is '{config.input.poses}' but {sequence.name} brings no poses; add "
+            "world_T_cam_init.npy (T, 4, 4) to the sequence or set input.poses to 'estimate'"
+        )
+    return sequence.initial_world_T_cam
+
+
 def camera_init_step(
     sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks, run: StageRunner = run_stage
 ) -> StageRecord:
     """Stage 1, or the given poses when the config takes them."""
-    if config.input.poses != "estimate":
-        if sequence.initial_world_T_cam is None:
-            raise InputError(
-                f"input.poses is '{config.input.poses}' but {sequence.name} brings no poses; add "
-                "world_T_cam_init.npy (T, 4, 4) to the sequence or set input.poses to 'estimate'"
-            )
-        arrays = {"world_T_cam": sequence.initial_world_T_cam, "intrinsics": sequence.intrinsics}
+    given = given_poses(sequence, config)
+    if given is not None:
+        arrays = {"world_T_cam": given, "intrinsics": sequence.intrinsics}
         return StageRecord(arrays, {"solves": [], "facts": [f"poses taken from the sequence ({config.input.poses})"]})
     result = initialize_cameras(
         labelled,

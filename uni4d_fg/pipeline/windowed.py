@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,7 +14,7 @@ from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.pipeline.fingerprint import stage_key
-from uni4d_fg.pipeline.steps import Arrays, bundle_summary, nonrigid_step
+from uni4d_fg.pipeline.steps import Arrays, bundle_summary, given_poses, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.progress import Reporter
@@ -82,7 +83,7 @@ class WindowedRun:
 def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
     """Solve stages 1 and 2 window by window and join them."""
     config, windows, labelled = windowed.config, windowed.windows, windowed.labelled
-    keys, dropped, initial = [], dict[str, int](), _initial_poses(windowed)
+    keys, dropped, initial = [], Counter[str](), given_poses(windowed.sequence, config)
     key, intrinsics, intrinsics_covariance, solves = _calibration(windowed, key, hooks)
     for window in windows:
         key = stage_key(key, [window.start, window.stop])
@@ -97,8 +98,7 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
         found = windowed.record("scene", window, key, compute)
         keys.append(key)
         solves += found.summary["solves"]
-        for reason, count in found.summary["dropped"].items():
-            dropped[reason] = dropped.get(reason, 0) + count
+        dropped.update(found.summary["dropped"])
 
     def scene_of(index: int) -> WindowScene:
         record = windowed.store.load(f"scene_{windows[index].start:06d}", keys[index])
@@ -179,18 +179,6 @@ def _join(windowed: WindowedRun, scene_of: Callable[[int], WindowScene], intrins
     return replace(joined, cameras=cameras)
 
 
-def _initial_poses(windowed: WindowedRun) -> FloatArray | None:
-    sequence, choice = windowed.sequence, windowed.config.input.poses
-    if choice == "estimate":
-        return None
-    if sequence.initial_world_T_cam is None:
-        raise InputError(
-            f"input.poses is '{choice}' but {sequence.name} brings no poses; add world_T_cam_init.npy (T, 4, 4) to the "
-            "sequence or set input.poses to 'estimate'"
-        )
-    return sequence.initial_world_T_cam
-
-
 def _joined_arrays(windows: list[Window], joined: Joined, parts: list[WindowLandmarks]) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of a stage 2 record; a landmark of several windows counts once, as the weighted mean."""
     cameras = joined.cameras
@@ -233,13 +221,12 @@ def _scene_part(scene: Arrays, window: Window, track: IntArray) -> Arrays:
 
 
 def _joined_summary(arrays: Arrays, summaries: list[dict[str, Any]]) -> dict[str, Any]:
-    dropped: dict[str, int] = {}
+    dropped = Counter[str]()
     for summary in summaries:
-        for reason, count in summary["dropped"].items():
-            dropped[reason] = dropped.get(reason, 0) + count
+        dropped.update(summary["dropped"])
     out: dict[str, Any] = {
         "solves": [solve for summary in summaries for solve in summary["solves"]],
-        "dropped": dropped,
+        "dropped": dict(dropped),
         "facts": [f"{len(arrays['track'])} trajectories of {len(np.unique(arrays['instance']))} instances"],
     }
     warnings = dict.fromkeys(text for summary in summaries for text in summary.get("warnings", []))

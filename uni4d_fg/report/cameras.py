@@ -128,8 +128,8 @@ def uncertainty(run: OpenedRun) -> Markup:
         ),
     ]  # fmt: skip
     text = (
-        "Marginal standard deviations relative to the first camera, which is held. They take the errors of tracks and "
-        "depth for independent; on real video they are too small."
+        "Marginal standard deviations relative to the first camera, which is held. They allow for errors that "
+        "neighbouring tracks share, not for those of the whole image, such as a distortion of the lens."
     )
     facts = []
     covariance = run.reconstruction.intrinsics_covariance

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from uni4d_fg.reconstruction.colors import depth_bounds
 from uni4d_fg.reconstruction.pictures.figure import spread_frames
 from uni4d_fg.report.chart import Line, line_chart
-from uni4d_fg.report.images import depth_bounds, depth_gradient, depth_picture
+from uni4d_fg.report.images import depth_gradient, depth_picture
 from uni4d_fg.report.markup import Markup, color_bar, element, figure, picture, section
 from uni4d_fg.view.content import thumbnail
 from uni4d_fg.view.opened_run import OpenedRun

@@ -7,20 +7,11 @@ import matplotlib
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
-from uni4d_fg.reconstruction.colors import value_colors
+from uni4d_fg.reconstruction.colors import css_stops, value_colors
 from uni4d_fg.view.content import thumbnail
 
 _MISSING = (150, 155, 162)
 _MIN_MAP_WIDTH = 480
-
-
-def depth_bounds(maps: list[Float32Array]) -> tuple[float, float]:
-    """Return the central 96 % of the depths of some maps, metres; 1 to 2 where there are none."""
-    values = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in maps])
-    if not values.size:
-        return 1.0, 2.0
-    low, high = np.percentile(values, [2.0, 98.0]).tolist()
-    return float(low), float(max(high, 1.01 * low))
 
 
 def depth_picture(depth: Float32Array, bounds: tuple[float, float], width: int) -> ImageArray:
@@ -37,8 +28,7 @@ def depth_picture(depth: Float32Array, bounds: tuple[float, float], width: int) 
 
 def depth_gradient() -> str:
     """Return the colours of :func:`depth_picture` from near to far as a CSS gradient."""
-    stops = np.rint(255.0 * matplotlib.colormaps["turbo_r"](np.linspace(0.0, 1.0, 9))[:, :3]).astype(int).tolist()
-    return "linear-gradient(to right," + ",".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in stops) + ")"
+    return css_stops(np.rint(255.0 * matplotlib.colormaps["turbo_r"](np.linspace(0.0, 1.0, 9))[:, :3]).astype(np.uint8))
 
 
 def residual_picture(

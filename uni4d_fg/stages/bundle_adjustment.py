@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from uni4d_fg.config.stages import BundleAdjustmentConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch, Slot
 from uni4d_fg.factors.depth_prior import STATIC_DEPTH_PRIOR
@@ -83,6 +83,12 @@ class Freedom:
 
     poses: bool
     intrinsics: bool
+
+
+def without_camera_motion(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:
+    """Return stage 2 without E_cam, which is made for consecutive frames."""
+    still = CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0)
+    return config.model_copy(update={"camera_motion": still})
 
 
 def bundle_adjustment_stage(

@@ -33,6 +33,7 @@ from uni4d_fg.stages.bundle_adjustment import (
     static_marginals,
     structure_stage,
     track_cells,
+    without_camera_motion,
 )
 from uni4d_fg.stages.camera_init import initialize_cameras
 from uni4d_fg.stages.lifting import lift, mean_per_row
@@ -211,10 +212,7 @@ def calibrate(
     """
     chosen = calibration_frames(TrackSpans.of(labelled), labelled.tracks.num_frames, frames)
     window = Window(0, len(chosen))
-    still = config.bundle_adjustment.camera_motion.model_copy(
-        update={"rotation_weight": 0.0, "translation_weight": 0.0}
-    )
-    ba = config.bundle_adjustment.model_copy(update={"camera_motion": still})
+    ba = without_camera_motion(config.bundle_adjustment)
     settings = config.model_copy(update={"bundle_adjustment": ba})
     scene, solves, _ = solve_scene(
         tracks_in(labelled, chosen), window, intrinsics, intrinsics, None, settings, hooks, run, free_intrinsics=True

@@ -10,7 +10,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
 from uni4d_fg.cues.structure.triangulation import RayBundle, ray_angles, sound, triangulate
 from uni4d_fg.cues.structure.two_view import relative_pose
@@ -18,10 +18,11 @@ from uni4d_fg.errors import Cancelled
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.graph.state import State, VariableNames
+from uni4d_fg.sequence.calibration import intrinsics_matrix
 from uni4d_fg.solve.levenberg_marquardt import Hooks
 from uni4d_fg.solve.marginals import camera_marginals
 from uni4d_fg.solve.summary import Termination
-from uni4d_fg.stages.bundle_adjustment import Freedom, StaticNoise, bundle_adjustment_stage
+from uni4d_fg.stages.bundle_adjustment import Freedom, StaticNoise, bundle_adjustment_stage, without_camera_motion
 from uni4d_fg.stages.observations import Observations
 from uni4d_fg.stages.stage import Stage, run_stage
 
@@ -114,7 +115,6 @@ class GrowingScene:
         visible = np.zeros(self.num_tracks, dtype=bool)
         visible[self.row[self.observations.frame == frame]] = True
         self.triangulate(missing & visible)
-        self._judge()
         return True
 
     def triangulate(self, which: BoolArray) -> None:
@@ -243,8 +243,7 @@ class GrowingScene:
 
 def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:
     """Return stage 2 without depth, and without E_cam: frames that have a pose need not follow each other."""
-    still = CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0)
-    return config.model_copy(update={"depth_prior": False, "camera_motion": still})
+    return without_camera_motion(config).model_copy(update={"depth_prior": False})
 
 
 def _resect(
@@ -253,8 +252,7 @@ def _resect(
     """Return the pose (4, 4) of a camera that sees N world points (N, 3) at uv (N, 2), or None."""
     if len(points) < min_points:
         return None
-    fx, fy, cx, cy = intrinsics
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    matrix = intrinsics_matrix(intrinsics)
     start = se3.inverse(guess)
     rotation, translation = cv2.Rodrigues(start[:3, :3])[0], start[:3, 3:].copy()
     found, rotation, translation, inliers = cv2.solvePnPRansac(

@@ -201,19 +201,8 @@ def _triangulate_all(observations: Observations, poses: FloatArray, scene: Growi
     observations = observations.select(scene.registered[observations.frame])
     tracks, row = observations.rows()
     limit = scene.config.geometric_depth.max_reprojection_px
-    keep = np.ones(len(observations), dtype=bool)
-    for last in (False, True):
-        rays = RayBundle(
-            row[keep], poses[observations.frame[keep]], observations.uv[keep], scene.intrinsics, len(tracks)
-        )
-        points = triangulate(rays)
-        if not last:
-            keep = (
-                points.errors_of(
-                    RayBundle(row, poses[observations.frame], observations.uv, scene.intrinsics, len(tracks))
-                )
-                <= limit
-            )
+    rays = RayBundle(row, poses[observations.frame], observations.uv, scene.intrinsics, len(tracks))
+    points = triangulate(rays.select(triangulate(rays).errors_of(rays) <= limit))
     with np.errstate(invalid="ignore"):
         wrong = ~(points.error_px <= limit)
     points.position[wrong] = np.nan

@@ -40,6 +40,10 @@ class RayBundle:
     count: int
     """Number of tracks M."""
 
+    def select(self, keep: BoolArray) -> RayBundle:
+        """Return the rays with ``keep`` (N,), of the same M tracks."""
+        return RayBundle(self.row[keep], self.world_T_cam[keep], self.uv[keep], self.intrinsics, self.count)
+
 
 @dataclass(frozen=True)
 class Points:

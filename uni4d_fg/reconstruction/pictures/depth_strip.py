@@ -12,6 +12,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from uni4d_fg.arrays import Float32Array, ImageArray
+from uni4d_fg.reconstruction.colors import depth_bounds
 from uni4d_fg.reconstruction.pictures.figure import INK, MUTED, new_figure, save_figure, spread_frames
 from uni4d_fg.sequence.model import FrameSource
 
@@ -52,7 +53,8 @@ def draw_depth_strip(
     column_in = 2.5
     figure = new_figure(column_in * len(frames) + 1.2, 4 * column_in * height / width + 0.5)
     grid = np.asarray(figure.subplots(4, len(frames), squeeze=False))
-    depth_norm = _depth_range(shown_cue + shown_fused)
+    low, high = depth_bounds(shown_cue + shown_fused)
+    depth_norm = LogNorm(low, high, clip=True)
     change_norm = _change_range(change)
     colors = matplotlib.colormaps["turbo_r"].with_extremes(bad=_MISSING)
     signed = matplotlib.colormaps["RdBu_r"].with_extremes(bad=_MISSING)
@@ -88,12 +90,6 @@ def _thin(array: np.ndarray) -> np.ndarray:
 def _positive(depth: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.nan)
-
-
-def _depth_range(maps: list[np.ndarray]) -> LogNorm:
-    values = np.concatenate([depth[np.isfinite(depth)] for depth in maps])
-    low, high = np.percentile(values, [2.0, 98.0]) if len(values) else (1.0, 2.0)
-    return LogNorm(float(low), float(max(high, 1.01 * low)), clip=True)
 
 
 def _change_range(maps: list[np.ndarray]) -> Normalize:
