@@ -76,12 +76,13 @@ TrajectorySystem make_system(const AnyArray& track, int threads) {
 
 using LinearizeResult = std::tuple<FloatArray, std::optional<std::pair<int, std::int64_t>>>;
 
-LinearizeResult linearize(TrajectorySystem& system, const AnyArray& points) {
+LinearizeResult linearize(TrajectorySystem& system, const AnyArray& points, double kernel_curvature) {
   const double* data = expect_points(system, points);
+  if (!(kernel_curvature >= 0.0 && kernel_curvature < 1.0)) refuse("kernel_curvature: must be at least 0 and below 1");
   NonFinite bad;
   {
     nb::gil_scoped_release release;
-    bad = system.linearize(data);
+    bad = system.linearize(data, kernel_curvature);
   }
   std::optional<std::pair<int, std::int64_t>> failure;
   if (bad.any()) failure = {bad.batch, bad.row};
@@ -196,7 +197,7 @@ void bind_trajectory_system(nb::module_& module) {
              return to_array(out);
            },
            "points"_a)
-      .def("linearize", &linearize, "points"_a)
+      .def("linearize", &linearize, "points"_a, "kernel_curvature"_a = 0.0)
       .def("multiply", &multiply, "vector"_a)
       .def("diagonal_blocks", &diagonal_blocks)
       .def("solve", &solve, "damping"_a, "min_diagonal"_a, "max_diagonal"_a, "cg_tolerance"_a, "cg_max_iterations"_a);

@@ -120,7 +120,7 @@ void TrajectorySystem::plan() {
   plan_arap_blocks();
   const auto points = static_cast<std::size_t>(num_points_);
   for (auto* values : {&gradient_, &added_}) values->assign(3 * points, 0.0);
-  inside_.assign(12 * points, 0.0);
+  inside_.assign(18 * points, 0.0);
   blocks_.assign(24 * points, 0.0);
   factor_.assign(24 * points, 0.0F);
   planned_ = true;
@@ -256,7 +256,7 @@ void TrajectorySystem::plan_edges() {
   }
   direction_.assign(3 * edges, 0.0);
   factor_weight_.assign(count, 0.0);
-  factor_residual_.assign(count, 0.0);
+  factor_force_.assign(count, 0.0);
 }
 
 /// Whether an ARAP factor links two different tracks and its points of one track are one or two rows apart.

@@ -151,7 +151,7 @@ class TrajectorySystem::ConjugateGradients {
         size_(system.gradient_.size()),
         change_(system.edge_low_.size()),
         tension_(system.edge_low_.size()),
-        loose_(system.loose_scale_.empty() ? 0 : size_),
+        loose_(system.loose_stiffness_.empty() ? 0 : size_),
         partial_(static_cast<std::size_t>(system.num_chunks_)) {}
 
   /// result = (J^T J + added) vector; returns the sum of vector * result. Contains three barriers.
@@ -247,18 +247,15 @@ class TrajectorySystem::ConjugateGradients {
     const auto [begin, end] = s.chunk_points(chunk);
     double product = 0.0;
     for (std::size_t p = begin; p < end; ++p) {
-      const double* own = &s.inside_[12 * p];
+      const double* own = &s.inside_[18 * p];
       const double* v = vector + 3 * p;
-      double out[3] = {own[0] * v[0] + own[1] * v[1] + own[2] * v[2], own[1] * v[0] + own[3] * v[1] + own[4] * v[2],
-                       own[2] * v[0] + own[4] * v[1] + own[5] * v[2]};
+      double out[3] = {0.0, 0.0, 0.0};
+      add_symmetric_product(own, v, out);
       // Couplings are stored with the later point, and are zero where that is of the next track.
-      for (std::size_t lag = 1; lag <= 2; ++lag) {
-        const double* after = own + 12 * lag + 3 + 3 * lag;
-        for (std::size_t a = 0; a < 3; ++a) {
-          if (p >= begin + lag) out[a] += own[3 + 3 * lag + a] * v[static_cast<std::ptrdiff_t>(a) - static_cast<std::ptrdiff_t>(3 * lag)];
-          if (p + lag < end) out[a] += after[a] * v[3 * lag + a];
-        }
-      }
+      if (p >= begin + 1) add_symmetric_product(own + 6, v - 3, out);
+      if (p >= begin + 2) add_symmetric_product(own + 12, v - 6, out);
+      if (p + 1 < end) add_symmetric_product(own + 18 + 6, v + 3, out);
+      if (p + 2 < end) add_symmetric_product(own + 36 + 12, v + 6, out);
       for (auto e = static_cast<std::size_t>(s.low_start_[p]); e < static_cast<std::size_t>(s.low_start_[p + 1]); ++e) {
         for (std::size_t a = 0; a < 3; ++a) out[a] += tension_[e] * s.direction_[3 * e + a];
       }

@@ -116,28 +116,31 @@ double TrajectorySystem::energy_of(const Batch& batch, std::int32_t begin, std::
   return sum;
 }
 
-NonFinite TrajectorySystem::linearize(const double* points) {
+NonFinite TrajectorySystem::linearize(const double* points, double kernel_curvature) {
   linearized_ = false;
   std::fill(gradient_.begin(), gradient_.end(), 0.0);
   std::fill(inside_.begin(), inside_.end(), 0.0);
   std::vector<NonFinite> bad(static_cast<std::size_t>(threads_) + 1);
   linearize_edges(points);
-  linearize_arap(bad);
+  linearize_arap(kernel_curvature, bad);
   sum_over_edges();
   parallel_for(num_chunks_, useful_threads(threads_, num_chunks_, kRangeGrain), [&](int begin, int end, int worker) {
     for (int chunk = begin; chunk < end; ++chunk) {
       for (std::size_t b = 0; b < batches_.size(); ++b) {
         if (batches_[b].kind != Kind::kArap) {
-          linearize_inside(batches_[b], static_cast<int>(b), chunk, points, bad[static_cast<std::size_t>(worker)]);
+          linearize_inside(batches_[b], static_cast<int>(b), chunk, points, kernel_curvature,
+                           bad[static_cast<std::size_t>(worker)]);
         }
       }
       gather_arap(chunk);
     }
   });
   add_irregular_arap();
-  loose_scale_.clear();
+  loose_stiffness_.clear();
   for (std::size_t b = 0; b < batches_.size(); ++b) {
-    if (batches_[b].kind == Kind::kSmoothness) linearize_loose(batches_[b], static_cast<int>(b), points, bad.back());
+    if (batches_[b].kind == Kind::kSmoothness) {
+      linearize_loose(batches_[b], static_cast<int>(b), points, kernel_curvature, bad.back());
+    }
   }
   NonFinite first;
   for (const NonFinite& candidate : bad) first.merge(candidate);
@@ -159,7 +162,7 @@ void TrajectorySystem::linearize_edges(const double* points) {
   });
 }
 
-void TrajectorySystem::linearize_arap(std::vector<NonFinite>& bad) {
+void TrajectorySystem::linearize_arap(double kernel_curvature, std::vector<NonFinite>& bad) {
   for (std::size_t b = 0; b < batches_.size(); ++b) {
     const Batch& batch = batches_[b];
     if (batch.kind != Kind::kArap) continue;
@@ -170,9 +173,10 @@ void TrajectorySystem::linearize_arap(std::vector<NonFinite>& bad) {
                          distance_[static_cast<std::size_t>(factor_after_[f])];
         // A direction is not finite only if its distance is not.
         if (!std::isfinite(r)) bad[static_cast<std::size_t>(worker)].merge({static_cast<int>(b), batch.original[n]});
-        const double inverse_sigma = batch.inverse_sigma[n], whitened = r * inverse_sigma;
-        factor_residual_[f] = r;
-        factor_weight_[f] = batch.weight[n] * weight(batch.kernel, whitened * whitened) * inverse_sigma * inverse_sigma;
+        const double inverse_sigma = batch.inverse_sigma[n], squared = r * inverse_sigma * r * inverse_sigma;
+        const double scale = batch.weight[n] * weight(batch.kernel, squared) * inverse_sigma * inverse_sigma;
+        factor_force_[f] = scale * r;
+        factor_weight_[f] = scale * (1.0 - kernel_curvature * falloff(batch.kernel, squared));
       }
     });
   }
@@ -187,10 +191,9 @@ void TrajectorySystem::sum_over_edges() {
       double stiffness = 0.0, diagonal = 0.0, force = 0.0;
       for (std::int32_t i = entry_start_[e]; i < entry_start_[e + 1]; ++i) {
         const auto f = static_cast<std::size_t>(entries_[static_cast<std::size_t>(i)].factor);
-        const auto other = static_cast<std::size_t>(entries_[static_cast<std::size_t>(i)].other);
         stiffness += factor_weight_[f];
         if (factor_regular_[f]) diagonal += factor_weight_[f];
-        force += factor_weight_[f] * (distance_[e] - distance_[other]);
+        force += static_cast<std::size_t>(factor_now_[f]) == e ? factor_force_[f] : -factor_force_[f];
       }
       edge_stiffness_[e] = stiffness;
       edge_diagonal_[e] = diagonal;
@@ -201,7 +204,7 @@ void TrajectorySystem::sum_over_edges() {
 
 /// Add the factors of one batch that stay within the tracks of a chunk.
 void TrajectorySystem::linearize_inside(const Batch& batch, int batch_index, int chunk, const double* points,
-                                        NonFinite& bad) {
+                                        double kernel_curvature, NonFinite& bad) {
   const auto c = static_cast<std::size_t>(chunk);
   for (std::int32_t i = batch.chunk_start[c]; i < batch.chunk_start[c + 1]; ++i) {
     const auto n = static_cast<std::size_t>(i);
@@ -211,24 +214,18 @@ void TrajectorySystem::linearize_inside(const Batch& batch, int batch_index, int
       const std::int32_t* rows = &batch.rows[n * static_cast<std::size_t>(batch.slots)];
       smoothness_residual(points, rows, batch.slots, r);
       if (!std::isfinite(r[0] + r[1] + r[2])) bad.merge({batch_index, batch.original[n]});
-      double scale[3];
-      smoothness_scale(batch, n, r, scale);
+      double pull[3], stiffness[6];
+      linearize_smoothness(batch, n, kernel_curvature, r, pull, stiffness);
       const double* factor = smoothness_jacobian(batch.slots);
       for (int s = 0; s < batch.slots; ++s) {
         double* gradient = &gradient_[3 * static_cast<std::size_t>(rows[s])];
-        double* own = &inside_[12 * static_cast<std::size_t>(rows[s])];
-        for (int a = 0; a < 3; ++a) gradient[a] += factor[s] * scale[a] * r[a];
+        double* own = &inside_[18 * static_cast<std::size_t>(rows[s])];
+        for (int a = 0; a < 3; ++a) gradient[a] += factor[s] * pull[a];
         for (int t = 0; t < batch.slots; ++t) {
           const std::int32_t lag = rows[s] - rows[t];
           if (lag < 0) continue;
           const double product = factor[s] * factor[t];
-          if (lag == 0) {
-            own[0] += product * scale[0];
-            own[3] += product * scale[1];
-            own[5] += product * scale[2];
-          } else {
-            for (int a = 0; a < 3; ++a) own[3 + 3 * lag + a] += product * scale[a];
-          }
+          for (int i = 0; i < 6; ++i) own[6 * lag + i] += product * stiffness[i];
         }
       }
       continue;
@@ -249,20 +246,34 @@ void TrajectorySystem::linearize_inside(const Batch& batch, int batch_index, int
     }
     if (!std::isfinite(check)) bad.merge({batch_index, batch.original[n]});
     const double robust = batch.weight[n] * weight(batch.kernel, squared);
+    double pull[3] = {0.0, 0.0, 0.0};
     for (int a = 0; a < batch.dim; ++a) {
       const double scale = robust * inverse_sigma[a] * inverse_sigma[a];
-      for (int k = 0; k < 3; ++k) gradient_[3 * row + static_cast<std::size_t>(k)] += scale * r[a] * jacobian[3 * a + k];
-      add_square(scale, jacobian + 3 * a, &inside_[12 * row]);
+      for (int k = 0; k < 3; ++k) pull[k] += scale * r[a] * jacobian[3 * a + k];
+      add_square(scale, jacobian + 3 * a, &inside_[18 * row]);
     }
+    for (std::size_t k = 0; k < 3; ++k) gradient_[3 * row + k] += pull[k];
+    const double softening = kernel_curvature * falloff(batch.kernel, squared);
+    if (softening * robust > 0.0) add_square(-softening / (robust * squared), pull, &inside_[18 * row]);
   }
 }
 
-void TrajectorySystem::smoothness_scale(const Batch& batch, std::size_t n, const double* r, double* scale) const {
+/// Pull of a smoothness residual, and its stiffness: D w (I - c u u^T) D with D the inverse sigmas, u the direction of
+/// the whitened residual and c the part of the kernel's falloff that counts.
+void TrajectorySystem::linearize_smoothness(const Batch& batch, std::size_t n, double kernel_curvature, const double* r,
+                                            double* pull, double* stiffness) const {
   const double* inverse_sigma = &batch.inverse_sigma[3 * n];
   double squared = 0.0;
   for (int a = 0; a < 3; ++a) squared += r[a] * inverse_sigma[a] * r[a] * inverse_sigma[a];
   const double robust = batch.weight[n] * weight(batch.kernel, squared);
-  for (int a = 0; a < 3; ++a) scale[a] = robust * inverse_sigma[a] * inverse_sigma[a];
+  std::fill_n(stiffness, 6, 0.0);
+  constexpr int kDiagonal[3] = {0, 3, 5};
+  for (int a = 0; a < 3; ++a) {
+    stiffness[kDiagonal[a]] = robust * inverse_sigma[a] * inverse_sigma[a];
+    pull[a] = stiffness[kDiagonal[a]] * r[a];
+  }
+  const double softening = kernel_curvature * falloff(batch.kernel, squared);
+  if (softening * robust > 0.0) add_square(-softening / (robust * squared), pull, stiffness);
 }
 
 /// Copy what factors within a track gave to the blocks of a chunk, and add the part of ARAP.
@@ -271,14 +282,14 @@ void TrajectorySystem::gather_arap(int chunk) {
   const auto begin = static_cast<std::size_t>(track_start_[static_cast<std::size_t>(chunk_tracks_[c])]);
   const auto end = static_cast<std::size_t>(track_start_[static_cast<std::size_t>(chunk_tracks_[c + 1])]);
   for (std::size_t p = begin; p < end; ++p) {
-    const double* own = &inside_[12 * p];
+    const double* own = &inside_[18 * p];
     double* block = &blocks_[24 * p];
     double* gradient = &gradient_[3 * p];
     std::copy_n(own, 6, block);
-    std::fill_n(block + 6, 18, 0.0);
-    for (int a = 0; a < 3; ++a) {
-      block[6 + 4 * a] = own[6 + a];
-      block[15 + 4 * a] = own[9 + a];
+    for (int i = 0; i < 6; ++i) {
+      const int upper = 3 * kRowOf[i] + kColumnOf[i], lower = 3 * kColumnOf[i] + kRowOf[i];
+      block[6 + upper] = block[6 + lower] = own[6 + i];
+      block[15 + upper] = block[15 + lower] = own[12 + i];
     }
     const auto add_edge = [&](std::size_t e, double sign) {
       const double* direction = &direction_[3 * e];
@@ -333,23 +344,27 @@ void TrajectorySystem::add_irregular_arap() {
 }
 
 /// Add smoothness factors between tracks or beyond the bands; few, if any.
-void TrajectorySystem::linearize_loose(const Batch& batch, int batch_index, const double* points, NonFinite& bad) {
+void TrajectorySystem::linearize_loose(const Batch& batch, int batch_index, const double* points,
+                                       double kernel_curvature, NonFinite& bad) {
   const double* factor = smoothness_jacobian(batch.slots);
   const double unit[3][3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
   for (std::int32_t i = batch.first_loose; i < batch.size(); ++i) {
     const auto n = static_cast<std::size_t>(i);
     const std::int32_t* rows = &batch.rows[n * static_cast<std::size_t>(batch.slots)];
-    double r[3], scale[3];
+    double r[3], pull[3], stiffness[6];
     smoothness_residual(points, rows, batch.slots, r);
     if (!std::isfinite(r[0] + r[1] + r[2])) bad.merge({batch_index, batch.original[n]});
-    smoothness_scale(batch, n, r, scale);
-    loose_scale_.insert(loose_scale_.end(), scale, scale + 3);
+    linearize_smoothness(batch, n, kernel_curvature, r, pull, stiffness);
+    loose_stiffness_.insert(loose_stiffness_.end(), stiffness, stiffness + 6);
     const bool all_lags = complete(rows, batch.slots);
     for (int s = 0; s < batch.slots; ++s) {
-      for (std::size_t a = 0; a < 3; ++a) {
-        gradient_[3 * static_cast<std::size_t>(rows[s]) + a] += factor[s] * scale[a] * r[a];
-        for (int t = 0; t < batch.slots; ++t) {
-          add_block(rows[s], rows[t], all_lags, factor[s] * factor[t] * scale[a], unit[a], unit[a]);
+      for (std::size_t a = 0; a < 3; ++a) gradient_[3 * static_cast<std::size_t>(rows[s]) + a] += factor[s] * pull[a];
+      for (int t = 0; t < batch.slots; ++t) {
+        for (int i = 0; i < 6; ++i) {
+          const double product = factor[s] * factor[t] * stiffness[i];
+          const int row = kRowOf[i], column = kColumnOf[i];
+          add_block(rows[s], rows[t], all_lags, product, unit[row], unit[column]);
+          if (row != column) add_block(rows[s], rows[t], all_lags, product, unit[column], unit[row]);
         }
       }
     }
@@ -362,13 +377,15 @@ void TrajectorySystem::multiply_loose(const double* vector, double* result) cons
   for (const Batch& batch : batches_) {
     if (batch.kind != Kind::kSmoothness) continue;
     const double* factor = smoothness_jacobian(batch.slots);
-    for (std::int32_t i = batch.first_loose; i < batch.size(); ++i, position += 3) {
+    for (std::int32_t i = batch.first_loose; i < batch.size(); ++i, position += 6) {
       const std::int32_t* rows = &batch.rows[static_cast<std::size_t>(i) * static_cast<std::size_t>(batch.slots)];
-      for (std::size_t a = 0; a < 3; ++a) {
-        double product = 0.0;
-        for (int s = 0; s < batch.slots; ++s) product += factor[s] * vector[3 * static_cast<std::size_t>(rows[s]) + a];
-        product *= loose_scale_[position + a];
-        for (int s = 0; s < batch.slots; ++s) result[3 * static_cast<std::size_t>(rows[s]) + a] += factor[s] * product;
+      double change[3] = {0.0, 0.0, 0.0}, pull[3] = {0.0, 0.0, 0.0};
+      for (int s = 0; s < batch.slots; ++s) {
+        for (std::size_t a = 0; a < 3; ++a) change[a] += factor[s] * vector[3 * static_cast<std::size_t>(rows[s]) + a];
+      }
+      add_symmetric_product(&loose_stiffness_[position], change, pull);
+      for (int s = 0; s < batch.slots; ++s) {
+        for (std::size_t a = 0; a < 3; ++a) result[3 * static_cast<std::size_t>(rows[s]) + a] += factor[s] * pull[a];
       }
     }
   }

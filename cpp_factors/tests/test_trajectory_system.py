@@ -121,15 +121,19 @@ def assert_close(ours: np.ndarray, reference: np.ndarray, tolerance: float) -> N
     kernel=st.sampled_from(KERNELS),
     scrambled=st.booleans(),
     behind=st.booleans(),
+    curvature=st.sampled_from((0.0, 0.4, 0.9)),
 )
-def test_parity_with_numpy(seed: int, lengths: list[int], kernel: str, scrambled: bool, behind: bool) -> None:
+def test_parity_with_numpy(
+    seed: int, lengths: list[int], kernel: str, scrambled: bool, behind: bool, curvature: float
+) -> None:
     problem, state = make_problem(seed, lengths, kernel, scrambled=scrambled, behind=behind)
-    system, reference = system_of(problem, state), TrajectoryObjective(problem, state, EXACT, threads=1)
+    config = EXACT.model_copy(update={"kernel_curvature": curvature})
+    system, reference = system_of(problem, state), TrajectoryObjective(problem, state, config, threads=1)
     points = state["dynamic_point"]
     expected = [batch.energy(state) for batch in problem.batches]
     np.testing.assert_allclose(system.energies(points), expected, rtol=1e-12, atol=1e-12 * max(expected))
-    gradient, failure = system.linearize(points)
-    linearization = reference.linearize(state)
+    gradient, failure = system.linearize(points, curvature)
+    linearization = reference.linearize_curved(state)
     assert failure is None
     assert_close(gradient, linearization.gradient, 1e-10)
     vector = np.random.default_rng(seed).normal(size=len(gradient))
@@ -217,6 +221,9 @@ def test_order_of_calls_and_arguments_are_checked() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             system.solve(*arguments)
+    for curvature in (-0.1, 1.0, np.nan):
+        with pytest.raises(ValueError, match="kernel_curvature: must be at least 0 and below 1"):
+            system.linearize(np.zeros((3, 3)), curvature)
     with pytest.raises(ValueError, match="track: points of one track must be consecutive"):
         _core.TrajectorySystem(np.array([0, 1, 0]))
     with pytest.raises(ValueError, match="track: entry 0 is -1"):

@@ -32,6 +32,15 @@ def test_rho_grows_and_weight_does_not(kernel: Kernel) -> None:
     assert np.isfinite(kernel.weight(np.zeros(1))).all()
 
 
+@pytest.mark.parametrize("kernel", KERNELS, ids=IDS)
+def test_falloff_is_how_fast_the_weight_falls(kernel: Kernel) -> None:
+    s = S[np.abs(S / kernel.threshold - 1.0) > 1e-4]  # Huber's has a step there
+    step = 1e-5 * s
+    numerical = -(kernel.weight((s + step) ** 2) - kernel.weight((s - step) ** 2)) / (2e-5 * kernel.weight(s**2))
+    np.testing.assert_allclose(kernel.falloff(s**2), np.minimum(numerical, 1.0), rtol=1e-4, atol=1e-8)
+    assert kernel.falloff(np.zeros(1)) == 0.0
+
+
 @pytest.mark.parametrize("c", [0.5, 1.345, 4.0])
 @pytest.mark.parametrize("kind", ["huber", "cauchy"])
 def test_parity_with_gtsam(kind: str, c: float) -> None:

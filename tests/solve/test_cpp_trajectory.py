@@ -19,13 +19,16 @@ from uni4d_fg.solve.trajectory_cg import TrajectoryObjective
 
 pytest.importorskip("uni4d_fg_cpp", reason="needs the C++ extension: pip install ./cpp_factors")
 
-EXACT = SolverConfig(cg_tolerance=1e-12, cg_max_iterations=5000)
+EXACT = SolverConfig(cg_tolerance=1e-12, cg_max_iterations=5000, kernel_curvature=0.8)
 KERNELS = [Kernel(), Kernel("huber", 1.3), Kernel("pseudo_huber", 2.0), Kernel("cauchy", 2.0), Kernel("norm", 0.1)]
 
 
+@pytest.mark.parametrize("curved", [False, True])
 @pytest.mark.parametrize("kernel", KERNELS, ids=lambda k: k.kind)
 @pytest.mark.parametrize(("tracks", "frames"), [(1, 1), (1, 2), (1, 20), (5, 1), (6, 7)])
-def test_energies_gradient_and_step(rng: np.random.Generator, kernel: Kernel, tracks: int, frames: int) -> None:
+def test_energies_gradient_and_step(
+    rng: np.random.Generator, kernel: Kernel, tracks: int, frames: int, curved: bool
+) -> None:
     if frames < 3:
         problem, state = trajectories(rng, tracks, 3, kernel=kernel)
         problem, state = first_frames(problem, state, 3, frames)
@@ -37,7 +40,7 @@ def test_energies_gradient_and_step(rng: np.random.Generator, kernel: Kernel, tr
     expected = reference.energies(state)
     for term, energy in ours.energies(state).items():
         np.testing.assert_allclose(energy, expected[term], rtol=1e-12)
-    mine, theirs = ours.linearize(state), reference.linearize(state)
+    mine, theirs = (o.linearize_curved(state) if curved else o.linearize(state) for o in (ours, reference))
     scale = np.abs(theirs.gradient).max()
     np.testing.assert_allclose(mine.gradient, theirs.gradient, rtol=1e-10, atol=1e-10 * scale)
     assert mine.gradient_max == np.abs(mine.gradient).max()
@@ -68,10 +71,17 @@ def first_frames(problem: Problem, state: State, frames: int, kept: int) -> tupl
     return Problem(tuple(batches), {"dynamic_point": problem.free["dynamic_point"][stays]}), state
 
 
+@pytest.mark.parametrize("kernel_curvature", [0.0, 0.7])
 @pytest.mark.parametrize("kernel", KERNELS, ids=lambda k: k.kind)
-def test_same_solution(rng: np.random.Generator, kernel: Kernel) -> None:
+def test_same_solution(rng: np.random.Generator, kernel: Kernel, kernel_curvature: float) -> None:
     problem, state = trajectories(rng, 12, 10, kernel=kernel)
-    config = SolverConfig(relative_decrease=1e-8, max_iterations=100, cg_tolerance=1e-6, cg_max_iterations=2000)
+    config = SolverConfig(
+        relative_decrease=1e-8,
+        max_iterations=100,
+        kernel_curvature=kernel_curvature,
+        cg_tolerance=1e-6,
+        cg_max_iterations=2000,
+    )
     ours, summary = minimize(CppTrajectoryObjective(problem, state, config), state, config)
     theirs, reference = minimize(TrajectoryObjective(problem, state, config), state, config)
     assert summary.initial_energy > 1.2 * summary.final_energy

@@ -169,6 +169,18 @@ def test_coupling_beyond_the_bands_keeps_the_preconditioner_positive_definite(rn
     np.testing.assert_allclose(step.delta, np.linalg.solve(damped, -gradient), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.parametrize("kind", ["huber", "pseudo_huber", "cauchy", "norm"])
+def test_the_curvature_of_kernels_shortens_the_end(rng: np.random.Generator, kind: str) -> None:
+    problem, state = trajectories(rng, 12, 10, kernel=Kernel(kind, 0.3))  # type: ignore[arg-type]
+    reweighted = SolverConfig(relative_decrease=1e-9, max_iterations=300)
+    _, plain = minimize(TrajectoryObjective(problem, state, reweighted), state, reweighted)
+    config = reweighted.model_copy(update={"kernel_curvature": 0.7})
+    _, curved = minimize(TrajectoryObjective(problem, state, config), state, config)
+    assert curved.converged
+    assert len(curved.iterations) < 0.8 * len(plain.iterations)
+    assert curved.final_energy <= plain.final_energy * (1.0 + 1e-7)
+
+
 def test_frozen_points_and_other_groups_are_refused(rng: np.random.Generator) -> None:
     problem, state = trajectories(rng)
     free = {"dynamic_point": problem.free["dynamic_point"].copy()}

@@ -27,6 +27,13 @@ class SolverConfig(Section):
     max_damping: float = setting(1e10, "Damping above which the solve stops with 'damping limit'.", gt=0)
     min_diagonal: float = setting(1e-6, "Floor of the Hessian's diagonal used for damping.", gt=0)
     max_diagonal: float = setting(1e32, "Ceiling of the Hessian's diagonal used for damping.", gt=0)
+    kernel_curvature: float = setting(
+        0.0,
+        "Moving points only: part of the robust kernels' curvature that the steps account for once one has lowered "
+        "the energy by less than 0.5 %; 0 reweights only, which ends slowly.",
+        ge=0,
+        lt=1,
+    )
     cg_tolerance: float = setting(0.03, "Relative residual at which an inexact inner solve stops.", gt=0, lt=1)
     cg_max_iterations: int = setting(200, "Largest number of inner conjugate-gradient steps.", ge=1)
 

@@ -130,8 +130,13 @@ class FactorBatch:
         # Not np.dot: BLAS may spread it over threads, which costs more than it gains and changes the rounding.
         return float(np.sum(self.weight * self.kernel.rho(self.squared_norm(state))))
 
-    def linearize(self, state: State) -> tuple[FloatArray, list[FloatArray]]:
-        """Return residuals (N, d) and Jacobians (N, d, dim) with noise, weight and kernel applied (IRLS).
+    def linearize(self, state: State, kernel_curvature: float = 0.0) -> tuple[FloatArray, list[FloatArray]]:
+        """Return residuals (N, d) and Jacobians (N, d, dim) with noise, weight and kernel applied.
+
+        Args:
+            state: Where.
+            kernel_curvature: Part of the kernel's falloff that J^T J accounts for, in [0, 1); 0 reweights only (IRLS).
+                J^T r is the gradient of the energy in any case.
 
         Raises:
             SolverError: If a Jacobian has the wrong shape or anything is not finite; names the variables.
@@ -140,10 +145,18 @@ class FactorBatch:
         self.check(r, jacobians, state)
         inverse_sigma = self._inverse_sigma()
         r = r * inverse_sigma
-        scale = np.sqrt(self.weight * self.kernel.weight(np.einsum("nd,nd->n", r, r)))
-        r *= scale[:, None]
+        squared = np.einsum("nd,nd->n", r, r)
+        scale = np.sqrt(self.weight * self.kernel.weight(squared))
         row_scale = (inverse_sigma * scale[:, None])[:, :, None]
-        return r, [jacobian * row_scale for jacobian in jacobians]
+        jacobians = [jacobian * row_scale for jacobian in jacobians]
+        if kernel_curvature > 0.0:
+            # With u the residual's direction: J becomes (I - a u u^T) J and r becomes r / (1 - a).
+            kept = np.sqrt(1.0 - kernel_curvature * self.kernel.falloff(squared))
+            direction = r / np.sqrt(np.maximum(squared, 1e-300))[:, None]
+            along = ((1.0 - kept)[:, None] * direction)[:, :, None]
+            jacobians = [j - along * (direction[:, None, :] @ j) for j in jacobians]
+            scale = scale / kept
+        return r * scale[:, None], jacobians
 
     def check(self, r: FloatArray, jacobians: list[FloatArray], state: State) -> None:
         """Check what the family's ``linearize`` returned; ``state`` names the variables.

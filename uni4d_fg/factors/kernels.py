@@ -65,6 +65,25 @@ class Kernel:
             result = 1.0 / np.sqrt(squared + c * c)
         return result
 
+    def falloff(self, squared: FloatArray) -> FloatArray:
+        """Return how fast the weight falls along the residual, ``-s w'(s) / w(s)``, at most 1; same shape.
+
+        The curvature of the kernel is ``w`` across the residual and ``w (1 - falloff)`` along it, zero where the true
+        one would be negative (Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 4.3).
+        """
+        c = self.threshold
+        ratio = squared / (c * c)
+        result: FloatArray
+        if self.kind == "quadratic":
+            result = np.zeros_like(squared)
+        elif self.kind == "huber":
+            result = np.where(ratio > 1.0, 1.0, 0.0)
+        elif self.kind == "cauchy":
+            result = np.minimum(2.0 * ratio / (1.0 + ratio), 1.0)
+        else:
+            result = ratio / (1.0 + ratio)
+        return result
+
     def slope(self, squared: FloatArray, dim: int) -> FloatArray:
         """Return the slope of ``w(s) r`` with respect to a residual r of ``dim`` entries, averaged over directions.
 

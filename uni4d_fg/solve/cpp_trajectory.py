@@ -134,7 +134,14 @@ class CppTrajectoryObjective:
         Raises:
             SolverError: If a factor is not finite; names its variables.
         """
-        gradient, failure = self._system.linearize(self._points(state))
+        return self._linearize(state, 0.0)
+
+    def linearize_curved(self, state: State) -> CppTrajectoryLinearization:
+        """Return the same with the part ``kernel_curvature`` of the kernels' curvature."""
+        return self._linearize(state, self.config.kernel_curvature)
+
+    def _linearize(self, state: State, kernel_curvature: float) -> CppTrajectoryLinearization:
+        gradient, failure = self._system.linearize(self._points(state), kernel_curvature)
         if failure is not None:
             batch = self._batches[failure[0]]
             self._blame(batch, state)

@@ -4,6 +4,8 @@ Damping follows Nielsen (1999), "Damping parameter in Marquardt's method": an ac
 q scales the damping by max(1/3, 1 - (2q - 1)^3), a rejected one by a factor that doubles each time. A step
 is accepted only if it lowers the energy, so that the energy never rises.
 
+Once a step lowers the energy by little, objectives that know the curvature of their robust kernels are asked for it.
+
 The damping diagonal has a floor, so that a variable which no factor determines stays where it is instead of
 making the system singular. What remains singular at every damping is reported with the variables' names.
 """
@@ -18,13 +20,15 @@ from typing import Any, TypeVar
 
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import SolverError
-from uni4d_fg.solve.objective import Objective, Step
+from uni4d_fg.solve.objective import CurvedObjective, Objective, Step
 from uni4d_fg.solve.summary import IterationRecord, SolveSummary, Termination
 
 StateT = TypeVar("StateT")
 
 _MIN_GAIN = 1e-4
 _MIN_DAMPING = 1e-12
+_NEAR = 5e-3
+"""A step that lowers the energy by less than this part is near the minimum."""
 
 
 @dataclass
@@ -85,6 +89,8 @@ def minimize(
         raise SolverError(f"{name}: the starting energy of {', '.join(bad)} is not finite")
 
     damping, growth = config.initial_damping, 2.0
+    curved = objective if isinstance(objective, CurvedObjective) else None
+    near = False
     records: list[IterationRecord] = []
     termination = Termination.MAX_ITERATIONS
     while len(records) < config.max_iterations:
@@ -95,7 +101,7 @@ def minimize(
             termination = Termination.ZERO_ENERGY
             break
         began = time.perf_counter()
-        linearization = objective.linearize(state)
+        linearization = curved.linearize_curved(state) if curved is not None and near else objective.linearize(state)
         clock.add("linearize", began)
         if linearization.gradient_max <= config.gradient_tolerance:
             termination = Termination.GRADIENT
@@ -132,6 +138,7 @@ def minimize(
             break
         trial_energy = sum(trial_energies.values())
         decrease = (energy - trial_energy) / energy
+        near = near or decrease < _NEAR
         state, energies, energy = accepted, trial_energies, trial_energy
         assert step is not None
         records.append(IterationRecord(energy, clock.elapsed(), damping, rejected, step.inner_iterations))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 StateT = TypeVar("StateT")
 
@@ -52,4 +52,20 @@ class Objective(Protocol[StateT]):
 
     def diagnose(self, state: StateT) -> str:
         """Return a sentence on why the linear system is singular at ``state``, with decoded variables."""
+        ...
+
+
+@runtime_checkable
+class CurvedObjective(Protocol):
+    """An objective that also has a model for the end of a solve.
+
+    Reweighted least squares takes the weights of robust kernels for constant. Its steps are safe from afar and too
+    short near the minimum, where it converges linearly.
+    """
+
+    def linearize_curved(self, state: Any) -> Linearization:
+        """Return the quadratic model at ``state`` that accounts for how the kernels' weights change.
+
+        The gradient is that of ``linearize``, and the model is positive semidefinite as well.
+        """
         ...

@@ -47,9 +47,9 @@ class _Planned:
         self.jacobian: FloatArray | None = None
         """(n, d, slots, 3) view into the sparse J, for factors between tracks."""
 
-    def linearize(self, piece: int, state: State) -> None:
+    def linearize(self, piece: int, state: State, kernel_curvature: float) -> None:
         """Write the residuals and Jacobians of one piece."""
-        r, jacobians = self.pieces[piece].linearize(state)
+        r, jacobians = self.pieces[piece].linearize(state, kernel_curvature)
         rows = slice(self.starts[piece], self.starts[piece] + len(r))
         self.residual[:, rows] = r.T
         for slot, jacobian in enumerate(jacobians):
@@ -144,7 +144,14 @@ class TrajectoryObjective:
 
     def linearize(self, state: State) -> TrajectoryLinearization:
         """Return the gradient and J^T J at ``state``; they are valid until the next call."""
-        map_in_order(lambda task: task[0].linearize(task[1], state), self._tasks, self.threads)
+        return self._linearize(state, 0.0)
+
+    def linearize_curved(self, state: State) -> TrajectoryLinearization:
+        """Return the same with the part ``kernel_curvature`` of the kernels' curvature."""
+        return self._linearize(state, self.config.kernel_curvature)
+
+    def _linearize(self, state: State, kernel_curvature: float) -> TrajectoryLinearization:
+        map_in_order(lambda task: task[0].linearize(task[1], state, kernel_curvature), self._tasks, self.threads)
         gradient, bands = np.zeros(self.size), np.zeros((BANDS, self.size))
         for planned in self._inside:
             planned.assembler.add_gradient(planned.components, planned.residual, gradient)

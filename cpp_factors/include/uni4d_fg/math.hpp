@@ -75,6 +75,13 @@ UNI4D_FG_INLINE Mat3 transposed(const Mat3& a) {
   return {{a(0, 0), a(1, 0), a(2, 0), a(0, 1), a(1, 1), a(2, 1), a(0, 2), a(1, 2), a(2, 2)}};
 }
 
+/// out += S v for a symmetric 3x3 matrix of six values: xx, xy, xz, yy, yz, zz.
+UNI4D_FG_INLINE void add_symmetric_product(const double* s, const double* v, double* out) {
+  out[0] += s[0] * v[0] + s[1] * v[1] + s[2] * v[2];
+  out[1] += s[1] * v[0] + s[3] * v[1] + s[4] * v[2];
+  out[2] += s[2] * v[0] + s[4] * v[1] + s[5] * v[2];
+}
+
 /// Matrix of the cross product, skew(v) w = v x w.
 UNI4D_FG_INLINE Mat3 skew(const Vec3& v) { return {{0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0}}; }
 

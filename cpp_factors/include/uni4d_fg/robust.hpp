@@ -65,6 +65,19 @@ UNI4D_FG_INLINE double weight(const Kernel& kernel, double squared) {
   }
 }
 
+/// How fast the weight falls along the residual, -s w'(s) / w(s), at most 1: a kernel's curvature is w there without it
+/// and w (1 - falloff) with it, where that is not negative.
+UNI4D_FG_INLINE double falloff(const Kernel& kernel, double squared) {
+  const double ratio = squared / (kernel.threshold * kernel.threshold);
+  switch (kernel.kind) {
+    case KernelKind::huber: return ratio > 1.0 ? 1.0 : 0.0;
+    case KernelKind::cauchy: return ratio < 1.0 ? 2.0 * ratio / (1.0 + ratio) : 1.0;
+    case KernelKind::pseudo_huber:
+    case KernelKind::norm: return 1.0 - 1.0 / (1.0 + ratio);
+    default: return 0.0;
+  }
+}
+
 /// Whiten a residual in place and return its squared norm. `inverse_sigma` has `dim` entries.
 template <int dim>
 UNI4D_FG_INLINE double whiten(double* r, const double* inverse_sigma) {

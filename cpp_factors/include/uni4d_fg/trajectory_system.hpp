@@ -79,7 +79,8 @@ class TrajectorySystem {
   /// Energy of every batch, sum of weight rho(|r / sigma|), at points (P, 3).
   std::vector<double> energies(const double* points) const;
   /// Form the gradient J^T r and all blocks at points (P, 3). Returns the first factor that is not finite, if any.
-  NonFinite linearize(const double* points);
+  /// @param kernel_curvature  Part of the kernels' falloff that the blocks account for, in [0, 1); 0 reweights only.
+  NonFinite linearize(const double* points, double kernel_curvature = 0.0);
   const std::vector<double>& gradient() const { return gradient_; }
   /// Undamped 3x3 diagonal block of a point: xx, xy, xz, yy, yz, zz.
   std::array<double, 6> diagonal_block(std::int64_t point) const;
@@ -137,14 +138,17 @@ class TrajectorySystem {
 
   double energy_of(const Batch& batch, std::int32_t begin, std::int32_t end, const double* points) const;
   void linearize_edges(const double* points);
-  void linearize_arap(std::vector<NonFinite>& bad);
+  void linearize_arap(double kernel_curvature, std::vector<NonFinite>& bad);
   void sum_over_edges();
-  void linearize_inside(const Batch& batch, int batch_index, int chunk, const double* points, NonFinite& bad);
-  void smoothness_scale(const Batch& batch, std::size_t n, const double* r, double* scale) const;
+  void linearize_inside(const Batch& batch, int batch_index, int chunk, const double* points, double kernel_curvature,
+                        NonFinite& bad);
+  void linearize_smoothness(const Batch& batch, std::size_t n, double kernel_curvature, const double* r, double* pull,
+                            double* stiffness) const;
   void gather_arap(int chunk);
   void add_block(std::int32_t row, std::int32_t column, bool all_lags, double scale, const double* a, const double* b);
   void add_irregular_arap();
-  void linearize_loose(const Batch& batch, int batch_index, const double* points, NonFinite& bad);
+  void linearize_loose(const Batch& batch, int batch_index, const double* points, double kernel_curvature,
+                       NonFinite& bad);
   void multiply_loose(const double* vector, double* result) const;
 
   class ConjugateGradients;
@@ -179,14 +183,14 @@ class TrajectorySystem {
   std::vector<std::uint8_t> factor_regular_;
   mutable std::vector<double> distance_;                ///< (E)
   std::vector<double> direction_;                       ///< (E, 3)
-  std::vector<double> factor_weight_, factor_residual_;  ///< (F) squared row scale, and residual in m.
+  std::vector<double> factor_weight_, factor_force_;    ///< (F) stiffness, and pull on the first of its edges.
   std::vector<double> edge_stiffness_, edge_force_;     ///< (E) sums over factors.
   std::vector<double> edge_diagonal_;                   ///< (E) as edge_stiffness_, regular factors only.
 
   std::vector<double> gradient_;      ///< (3 P)
-  std::vector<double> inside_;        ///< (P, 12) J^T J of factors within a track: block, and diagonals of lags 1, 2.
+  std::vector<double> inside_;        ///< (P, 18) J^T J of factors within a track: block, lag 1, lag 2, all symmetric.
   std::vector<double> blocks_;        ///< (P, 24) all of J^T J within a track: block, lag 1, lag 2.
-  std::vector<double> loose_scale_;   ///< Smoothness beyond the bands: squared row scales (factors, 3).
+  std::vector<double> loose_stiffness_; ///< Smoothness beyond the bands: symmetric stiffness (factors, 6).
   std::vector<double> added_;         ///< (3 P) damping.
   std::vector<float> factor_;         ///< (P, 24) Cholesky: inverse of the diagonal block, lags 1 and 2.
 };

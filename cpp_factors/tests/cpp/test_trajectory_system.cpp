@@ -112,6 +112,13 @@ void test_consistency(int tracks, int frames, KernelKind kind, bool scrambled) {
   double curvature = 0.0;
   for (std::size_t i = 0; i < direction.size(); ++i) curvature += direction[i] * product[i];
   check(curvature >= 0.0, "J^T J is not negative");
+  check(!system.linearize(scene.points.data(), 0.9).any(), "every factor is finite with its kernel's curvature");
+  std::vector<double> curved(gradient.size());
+  system.multiply(direction.data(), curved.data());
+  double lower = 0.0;
+  for (std::size_t i = 0; i < direction.size(); ++i) lower += direction[i] * curved[i];
+  check(lower >= 0.0 && lower <= curvature * (1.0 + 1e-12), "the curvature of kernels only lowers J^T J");
+  system.linearize(scene.points.data());
   const auto result = system.solve(1e-2, 1e-6, 1e32, 1e-10, 2000);
   check(result.has_value() && std::isfinite(result->norm) && result->predicted_decrease >= 0.0, "there is a step");
   TrajectorySystem other = make_system(scene, {kind, 0.8}, scrambled, 3, same);
