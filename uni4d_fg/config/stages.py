@@ -182,7 +182,13 @@ class NonRigidConfig(Section):
     )
     outlier_margin: float = setting(1.0, "Added to that quantile.", ge=0)
     solver: SolverConfig = setting(
-        SolverConfig(max_iterations=60, relative_decrease=1e-7, early_relative_decrease=1e-1, kernel_curvature=0.7),
+        SolverConfig(
+            max_iterations=60,
+            relative_decrease=1e-7,
+            early_relative_decrease=1e-1,
+            kernel_curvature=0.7,
+            cg_tolerance=0.06,
+        ),
         "Solver.",
     )
 
