@@ -7,7 +7,7 @@ import pytest
 
 from uni4d_fg.compare.comparison import Comparison
 from uni4d_fg.compare.contest import Contest, Performance, Reach
-from uni4d_fg.compare.markdown import accuracy_table, markdown, ratio
+from uni4d_fg.compare.markdown import accuracy_table, markdown, ratio, ratio_table
 from uni4d_fg.compare.verdict import losses, stage_ratios
 from uni4d_fg.compare.whole_run import WholeRun
 
@@ -83,6 +83,25 @@ def test_every_loss_is_said() -> None:
     ]
     assert math.isinf(stage_ratios(bad, "adam")[0].time)
     assert "never" in markdown([bad], {}, "command")
+
+
+def test_energies_missed_in_some_of_many_solves_are_counted() -> None:
+    windows = Contest(
+        "camera_init",
+        "common",
+        59,
+        {
+            "lm": performance(1.0, 0.5, 0.2, missed=2, higher=2),
+            "adam": performance(2.0, 10.0, 10.0, missed=57, name="adam"),
+        },
+    )
+    partly = replace(GOOD, contests=[windows, *GOOD.contests[1:]])
+    first, last = (r for r in stage_ratios(partly, "adam") if r.stage in ("1", "1-3"))
+    assert math.isinf(first.time)
+    assert (first.missed, first.tasks, first.spent) == (2, 59, pytest.approx(0.2 / 10))
+    assert (last.missed, last.tasks, last.spent) == (2, 62, pytest.approx(0.7 / 24))
+    assert "| 1 | common | adam | 1/50, 2 of 59 never | 0.50000 | never |" in ratio_table(partly)
+    assert "camera_init from common: LM ends above adam in 2 of 59 solves" in losses(partly)
 
 
 @pytest.mark.parametrize(

@@ -81,10 +81,17 @@ class Contest:
 
 def time_ratio(contests: list[Contest], solver: str, opponent: str) -> float:
     """Return the ratio of :meth:`Contest.time_ratio` over several contests, times added."""
-    mine = [contest.performances[solver].reach[opponent] for contest in contests]
-    if any(reach.missed for reach in mine):
-        return math.inf
-    spent = sum(reach.seconds for reach in mine)
+    return math.inf if missed_tasks(contests, solver, opponent) else spent_ratio(contests, solver, opponent)
+
+
+def missed_tasks(contests: list[Contest], solver: str, opponent: str) -> int:
+    """Return in how many tasks the solver never gets to the opponent's final energy."""
+    return sum(contest.performances[solver].reach[opponent].missed for contest in contests)
+
+
+def spent_ratio(contests: list[Contest], solver: str, opponent: str) -> float:
+    """Return :func:`time_ratio`, but count a task in which the solver never gets there with all of its time."""
+    spent = sum(contest.performances[solver].reach[opponent].seconds for contest in contests)
     theirs = sum(contest.performances[opponent].reach[opponent].seconds for contest in contests)
     return spent / theirs if theirs > 0.0 else math.nan
 

@@ -8,14 +8,14 @@ from collections.abc import Iterable
 from uni4d_fg.compare.comparison import Comparison
 from uni4d_fg.compare.contest import Contest, Performance
 from uni4d_fg.compare.solvers import ADAM, LM
-from uni4d_fg.compare.verdict import losses, stage_ratios
+from uni4d_fg.compare.verdict import StageRatio, losses, stage_ratios
 from uni4d_fg.compare.whole_run import STAGES
 
 _LEGEND = (
     "Times are wall times in seconds, medians over the repetitions, warm-up left out. 'time ratio' is LM's time to the "
-    "other's final exact energy over the other's own time to it; 'never' means that it is not reached, 'not lowered' "
-    "that the other ends no lower than it started. Every solve is repeated by every solver from the same state with "
-    "the same variables free."
+    "other's final exact energy over the other's own time to it; 'never' means that it is not reached (one of several "
+    "solves then counts with all of LM's time), 'not lowered' that the other ends no lower than it started. Every "
+    "solve is repeated by every solver from the same state with the same variables free."
 )
 
 
@@ -66,7 +66,7 @@ def ratio_table(comparison: Comparison) -> list[str]:
     """Return LM against every other solver per stage and start."""
     head = ["stage", "start", "against", "time ratio", "energy LM / other", "other's time to LM's energy / LM's"]
     rows = [
-        [r.stage, r.start, r.opponent, ratio(r.time), f"{r.energy:.5f}", ratio(r.back)]
+        [r.stage, r.start, r.opponent, time_cell(r), f"{r.energy:.5f}", ratio(r.back)]
         for name in comparison.runs
         if name != LM
         for r in stage_ratios(comparison, name)
@@ -114,6 +114,13 @@ def accuracy_table(comparisons: list[Comparison]) -> list[str]:
 def terms(energy: dict[str, float]) -> str:
     """Return energies per term in one cell."""
     return ", ".join(f"{name} {value:.5g}" for name, value in energy.items())
+
+
+def time_cell(found: StageRatio) -> str:
+    """Return LM's time ratio; where it misses some of many energies, the ratio of the times spent and how many."""
+    if 0 < found.missed < found.tasks:
+        return f"{ratio(found.spent)}, {found.missed} of {found.tasks} never"
+    return ratio(found.time)
 
 
 def ratio(value: float) -> str:

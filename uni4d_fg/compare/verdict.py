@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from uni4d_fg.compare.comparison import Comparison
-from uni4d_fg.compare.contest import Contest, time_ratio
+from uni4d_fg.compare.contest import Contest, missed_tasks, spent_ratio, time_ratio
 from uni4d_fg.compare.solvers import LM
 from uni4d_fg.compare.trace import EQUAL
 
@@ -22,7 +22,13 @@ class StageRatio:
     start: str
     opponent: str
     time: float
-    """LM's time to the opponent's final energies over the opponent's own; infinite where it never got there."""
+    """LM's time to the opponent's final energies over the opponent's own; infinite if there is a task in which it
+    never got there."""
+    spent: float
+    """The same where such a task counts with LM's whole time."""
+    missed: int
+    """Number of those tasks."""
+    tasks: int
     back: float
     """The opponent's time to LM's final energies over LM's own; infinite where it never got there."""
     energy: float
@@ -51,9 +57,16 @@ def stage_ratios(comparison: Comparison, opponent: str) -> list[StageRatio]:
 
 def _ratio(stage: str, start: str, contests: list[Contest], opponent: str) -> StageRatio:
     return StageRatio(
-        stage, start, opponent, time_ratio(contests, LM, opponent), time_ratio(contests, opponent, LM),
+        stage,
+        start,
+        opponent,
+        time_ratio(contests, LM, opponent),
+        spent_ratio(contests, LM, opponent),
+        missed_tasks(contests, LM, opponent),
+        sum(contest.tasks for contest in contests),
+        time_ratio(contests, opponent, LM),
         max(contest.energy_ratio(LM, opponent) for contest in contests),
-    )  # fmt: skip
+    )
 
 
 def losses(comparison: Comparison) -> list[str]:
