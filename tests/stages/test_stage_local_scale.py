@@ -38,6 +38,14 @@ def test_a_smooth_field_is_predicted_better_than_by_the_frame(rng: np.random.Gen
     assert np.sqrt(np.mean(error**2)) < 0.25 * np.sqrt(np.mean(frame_error**2))
 
 
+def test_many_static_observations_are_measured_on_a_sample(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, 4000), scattered(rng, 50)
+    measured = FRAME_SCALE[static.frame] + smooth_field(static) + rng.normal(scale=0.01, size=len(static))
+    local = predict_log_scale(static, measured, FRAME_SCALE, queries, 24)
+    assert local.sigma == pytest.approx(0.01 * np.sqrt(1.0 + 0.5 * np.pi / 24), rel=0.05)  # a median of 24
+    assert local.frame_sigma > 0.03
+
+
 def test_white_noise_falls_back_to_the_scale_of_the_frame(rng: np.random.Generator) -> None:
     static, queries = scattered(rng, PER_FRAME), scattered(rng, 50)
     measured = FRAME_SCALE[static.frame] + rng.normal(scale=0.02, size=len(static))

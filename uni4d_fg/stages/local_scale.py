@@ -3,7 +3,7 @@ r"""The depth cue's scale where a moving object is, from the static scene around
 A cue errs by a frame-wide scale and, more weakly, by a field that is smooth over the image. The static
 landmarks measure both: s_i = log z_i - log D(uv_i). At a dynamic observation the scale is predicted by the
 median of the nearest static s_i in the image. Whether that is better than the frame's scale alone is not
-assumed but measured, by predicting every static s_i from its neighbours without itself.
+assumed but measured, by predicting static s_i from their neighbours without themselves.
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ from scipy.spatial import cKDTree
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.stages.noise import robust_sigma
 from uni4d_fg.stages.observations import Observations
+
+_SAMPLE = 512
+"""Static observations per frame on which the prediction is measured: enough for its standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,9 @@ def predict_log_scale(
         if len(known) <= neighbours:
             continue
         tree, values = cKDTree(static.uv[known]), deviation[known]
-        _, near = tree.query(static.uv[known], k=neighbours + 1)
-        errors.append(values - np.median(values[near[:, 1:]], axis=1))
+        sample = np.linspace(0, len(known) - 1, min(len(known), _SAMPLE)).astype(np.int64)
+        _, near = tree.query(static.uv[known[sample]], k=neighbours + 1)
+        errors.append(values[sample] - np.median(values[near[:, 1:]], axis=1))
         if len(mine):
             _, near = tree.query(queries.uv[mine], k=neighbours)
             predicted[mine] = np.median(values[near.reshape(len(mine), -1)], axis=1)
