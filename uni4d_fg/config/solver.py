@@ -30,7 +30,7 @@ class SolverConfig(Section):
     kernel_curvature: float = setting(
         0.0,
         "Moving points only: part of the robust kernels' curvature that the steps account for once one has lowered "
-        "the energy by less than 0.5 %; 0 reweights only, which ends slowly.",
+        "the energy by less than 0.2 %; 0 reweights only, which ends slowly.",
         ge=0,
         lt=1,
     )

@@ -27,7 +27,7 @@ StateT = TypeVar("StateT")
 
 _MIN_GAIN = 1e-4
 _MIN_DAMPING = 1e-12
-_NEAR = 5e-3
+_NEAR = 2e-3
 """A step that lowers the energy by less than this part is near the minimum."""
 
 
