@@ -183,6 +183,14 @@ void bind_trajectory_system(nb::module_& module) {
              nb::gil_scoped_release release;
              self.plan();
            })
+      .def("reweight",
+           [](TrajectorySystem& self, int batch, const AnyArray& weight, int kernel, double threshold) {
+             if (!self.planned()) refuse("call plan() first");
+             if (batch < 0 || batch >= self.num_batches()) refuse("batch: there is none of this number");
+             const auto weights = expect_weights(weight, "weight", self.num_factors(batch));
+             self.reweight(batch, weights.data, expect_kernel(kernel, threshold));
+           },
+           "batch"_a, "weight"_a, "kernel"_a, "threshold"_a)
       .def_prop_ro("num_points", &TrajectorySystem::num_points)
       .def_prop_ro("num_batches", &TrajectorySystem::num_batches)
       .def_prop_ro("threads", &TrajectorySystem::threads)

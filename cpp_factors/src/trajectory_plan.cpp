@@ -126,6 +126,13 @@ void TrajectorySystem::plan() {
   planned_ = true;
 }
 
+void TrajectorySystem::reweight(int batch, const double* weight, const Kernel& kernel) {
+  Batch& target = batches_[static_cast<std::size_t>(batch)];
+  target.kernel = kernel;
+  for (std::size_t i = 0; i < target.weight.size(); ++i) target.weight[i] = weight[target.original[i]];
+  linearized_ = false;
+}
+
 /// Cut the tracks into chunks of about the same number of points, whatever the number of threads.
 void TrajectorySystem::plan_chunks() {
   chunk_tracks_.assign(1, 0);
@@ -169,14 +176,13 @@ void TrajectorySystem::plan_inside(Batch& batch) {
     const bool inside = one_track && complete(rows, batch.slots);
     group[i] = inside ? chunk_of_track[static_cast<std::size_t>(track)] : num_chunks_;
   }
-  std::vector<std::int32_t> order(count);
-  std::iota(order.begin(), order.end(), 0);
-  std::stable_sort(order.begin(), order.end(), [&](std::int32_t a, std::int32_t b) {
-    return group[static_cast<std::size_t>(a)] < group[static_cast<std::size_t>(b)];
-  });
   batch.chunk_start.assign(static_cast<std::size_t>(num_chunks_) + 2, 0);
   for (const std::int32_t g : group) ++batch.chunk_start[static_cast<std::size_t>(g) + 1];
   accumulate_starts(batch.chunk_start);
+  std::vector<std::int32_t> order(count), next(batch.chunk_start.begin(), batch.chunk_start.end() - 1);
+  for (std::size_t i = 0; i < count; ++i) {
+    order[static_cast<std::size_t>(next[static_cast<std::size_t>(group[i])]++)] = static_cast<std::int32_t>(i);
+  }
   batch.first_loose = batch.chunk_start[static_cast<std::size_t>(num_chunks_)];
   if (std::is_sorted(order.begin(), order.end())) return;
   batch.rows = permuted(batch.rows, order, slots);
@@ -196,6 +202,8 @@ void TrajectorySystem::plan_edges() {
     if (batch.kind != Kind::kArap) continue;
     batch.first_factor = factors;
     factors += batch.size();
+    low.reserve(2 * static_cast<std::size_t>(factors));
+    high.reserve(low.capacity());
     for (std::size_t i = 0; i < batch.rows.size(); i += 2) {
       low.push_back(std::min(batch.rows[i], batch.rows[i + 1]));
       high.push_back(std::max(batch.rows[i], batch.rows[i + 1]));

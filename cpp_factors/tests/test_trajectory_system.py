@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -148,6 +149,35 @@ def test_parity_with_numpy(
         assert_close(delta, step.delta, 1e-7)
         assert norm == pytest.approx(step.norm, rel=1e-8)
         assert decrease == pytest.approx(step.predicted_decrease, rel=1e-8)
+
+
+@pytest.mark.parametrize("scrambled", [False, True])
+def test_other_weights_and_kernels_need_no_new_plan(scrambled: bool) -> None:
+    problem, state = make_problem(4, [9, 3, 7, 8], "huber", scrambled=scrambled, behind=False)
+    system, points = system_of(problem, state), state["dynamic_point"]
+    system.linearize(points)
+    rng = np.random.default_rng(0)
+    kernels = [Kernel("norm", 0.2), Kernel("cauchy", 2.0), Kernel(), Kernel("huber", 0.1), Kernel("pseudo_huber", 1.0)]
+    batches = tuple(
+        replace(batch, weight=rng.uniform(0.0, 3.0, len(batch)), kernel=kernel)
+        for batch, kernel in zip(problem.batches, kernels, strict=True)
+    )
+    for i, batch in enumerate(batches):
+        system.reweight(i, batch.weight, KERNELS.index(batch.kernel.kind), batch.kernel.threshold)
+    with pytest.raises(ValueError, match=r"linearize\(\) must succeed before solve\(\)"):
+        system.solve(1e-3, 1e-6, 1e32, 0.1, 10)
+    fresh = system_of(replace(problem, batches=batches), state)
+    np.testing.assert_array_equal(system.energies(points), fresh.energies(points))
+    np.testing.assert_array_equal(system.linearize(points, 0.5)[0], fresh.linearize(points, 0.5)[0])
+    np.testing.assert_array_equal(system.solve(1e-3, 1e-6, 1e32, 0.1, 10)[0], fresh.solve(1e-3, 1e-6, 1e32, 0.1, 10)[0])
+    for arguments, message in (
+        ((5, batch.weight, 0, 1.0), "batch: there is none of this number"),
+        ((0, batch.weight[:1], 0, 1.0), "weight: expected"),
+        ((4, -1.0 - batch.weight, 0, 1.0), "weight"),
+        ((4, batch.weight, 9, 1.0), "kernel"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            system.reweight(*arguments)
 
 
 def test_every_number_of_threads_gives_the_same_bits() -> None:

@@ -90,6 +90,21 @@ def test_same_solution(rng: np.random.Generator, kernel: Kernel, kernel_curvatur
     np.testing.assert_allclose(ours["dynamic_point"], theirs["dynamic_point"], atol=1e-6)
 
 
+def test_reweighting_is_as_good_as_a_new_objective(rng: np.random.Generator) -> None:
+    problem, state = trajectories(rng, 12, 10)
+    softer = tuple(replace(b, weight=0.1 * b.weight, kernel=Kernel("cauchy", 3.0)) for b in problem.batches)
+    other = replace(problem, batches=softer)
+    objective = CppTrajectoryObjective(problem, state, EXACT)
+    minimize(objective, state, EXACT)
+    objective.reweight(other)
+    ours, summary = minimize(objective, state, EXACT)
+    fresh, reference = minimize(CppTrajectoryObjective(other, state, EXACT), state, EXACT)
+    np.testing.assert_array_equal(ours["dynamic_point"], fresh["dynamic_point"])
+    assert summary.final_energies == reference.final_energies
+    with pytest.raises(SolverError, match="the same factors in the same order"):
+        objective.reweight(replace(problem, batches=problem.batches[1:]))
+
+
 def test_points_behind_the_camera_come_back(rng: np.random.Generator) -> None:
     problem, state = trajectories(rng)
     points = state["dynamic_point"].copy()

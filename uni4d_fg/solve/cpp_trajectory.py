@@ -92,6 +92,19 @@ class CppTrajectoryObjective:
             self._append(batch, state)
         self._system.plan()
 
+    def reweight(self, problem: Problem) -> None:
+        """Solve ``problem`` from now on, which has the same factors with other weights and kernels.
+
+        Raises:
+            SolverError: If its batches are not as many, or not as long.
+        """
+        batches = [batch for batch in problem.batches if len(batch)]
+        if [(b.family, len(b)) for b in batches] != [(b.family, len(b)) for b in self._batches]:
+            raise SolverError("reweighting takes the same factors in the same order")
+        self.problem, self._batches = problem, batches
+        for i, batch in enumerate(batches):
+            self._system.reweight(i, _dense(batch.weight), KERNEL_CODES[batch.kernel.kind], batch.kernel.threshold)
+
     def _append(self, batch: FactorBatch, state: State) -> None:
         name = _method(batch.family)
         assert name is not None

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from uni4d_fg.graph.problem import Problem
+
 StateT = TypeVar("StateT")
 
 
@@ -68,4 +70,13 @@ class CurvedObjective(Protocol):
 
         The gradient is that of ``linearize``, and the model is positive semidefinite as well.
         """
+        ...
+
+
+@runtime_checkable
+class Reweightable(Protocol):
+    """An objective whose plan outlives a change of weights and kernels."""
+
+    def reweight(self, problem: Problem) -> None:
+        """Solve ``problem`` from now on, which has the same factors with other weights and kernels."""
         ...

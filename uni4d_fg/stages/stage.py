@@ -14,6 +14,7 @@ from uni4d_fg.graph.problem import Problem
 from uni4d_fg.graph.state import State
 from uni4d_fg.solve.backend import Backend, LinearSolver, choose_backend, make_objective, solved_by
 from uni4d_fg.solve.levenberg_marquardt import Hooks, minimize
+from uni4d_fg.solve.objective import Objective, Reweightable
 from uni4d_fg.solve.summary import IterationRecord, SolveSummary, Termination
 
 
@@ -92,17 +93,39 @@ def run_stage(
         initial = problem.energies(state)
         return state, SolveSummary(stage.name, Termination.NOTHING_TO_DO, initial, initial, (), {"total": 0.0})
     ends: list[tuple[State, SolveSummary]] = []
+    rounds = _Rounds(stage, backend)
     for schedule in stage.schedules:
-        ends.append(_run_schedule(stage, schedule, state, hooks, backend))
+        ends.append(_run_schedule(rounds, schedule, state, hooks))
         if ends[-1][1].termination is Termination.CANCELLED:
             break
     kept, summary = min(ends, key=lambda end: end[1].final_energy)
     return kept, _join_schedules(summary, [summary for _, summary in ends])
 
 
+class _Rounds:
+    """Makes the objectives of the rounds of a stage; one that can be reweighted is planned once."""
+
+    def __init__(self, stage: Stage, backend: Backend):
+        self.stage, self.backend = stage, backend
+        self._planned: Objective[State] | None = None
+
+    def objective(self, step: Round, state: State, solver: SolverConfig) -> Objective[State]:
+        """Return what a round minimises."""
+        stage = self.stage
+        problem = Problem(tuple(step.apply(batch) for batch in stage.batches), stage.free)
+        if self._planned is not None and isinstance(self._planned, Reweightable):
+            self._planned.reweight(problem)
+        else:
+            self._planned = make_objective(
+                self.backend, problem, state, solver, eliminate=stage.eliminate, linear_solver=stage.linear_solver
+            )
+        return self._planned
+
+
 def _run_schedule(
-    stage: Stage, schedule: tuple[Round, ...], state: State, hooks: Hooks | None, backend: Backend
+    rounds: _Rounds, schedule: tuple[Round, ...], state: State, hooks: Hooks | None
 ) -> tuple[State, SolveSummary]:
+    stage, backend = rounds.stage, rounds.backend
     problem = stage.problem
     # An exact round measures the stage's own energy; GTSAM measures it behind the camera otherwise.
     exact = [step.is_exact and backend.name != "gtsam" for step in schedule]
@@ -111,14 +134,7 @@ def _run_schedule(
     solvers: list[str] = []
     for step in schedule:
         solver = stage.solver if step is schedule[-1] else _early(stage.solver)
-        objective = make_objective(
-            backend,
-            Problem(tuple(step.apply(batch) for batch in stage.batches), stage.free),
-            state,
-            solver,
-            eliminate=stage.eliminate,
-            linear_solver=stage.linear_solver,
-        )
+        objective = rounds.objective(step, state, solver)
         state, summary = minimize(objective, state, solver, name=stage.name, hooks=hooks)
         parts.append(summary)
         solvers.append(solved_by(objective))

@@ -70,9 +70,13 @@ class TrajectorySystem {
   /// Order the factors and plan all sums; call once after the last batch.
   void plan();
 
+  /// Give the factors of a batch, in the order in which they were added, other weights (N) and another kernel.
+  void reweight(int batch, const double* weight, const Kernel& kernel);
+
   int num_batches() const { return static_cast<int>(batches_.size()); }
   std::int64_t num_points() const { return num_points_; }
   int threads() const { return threads_; }
+  std::int64_t num_factors(int batch) const { return batches_[static_cast<std::size_t>(batch)].size(); }
   bool planned() const { return planned_; }
   bool linearized() const { return linearized_; }
 
