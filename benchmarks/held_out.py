@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.evaluate.trajectory import evaluate_trajectory
@@ -47,11 +47,6 @@ class Judged:
     ate_m: float | None
 
 
-def without(labelled: LabelledTracks, dropped: BoolArray) -> LabelledTracks:
-    """Return the tracks with some of them rejected."""
-    return replace(labelled, label=np.where(dropped, TrackLabel.REJECTED, labelled.label).astype(labelled.label.dtype))
-
-
 def reprojection_errors(labelled: LabelledTracks, scene: Arrays) -> FloatArray:
     """Return the errors of all observations of the scene's landmarks, px."""
     seen = observations_of(labelled, *STATIC)
@@ -75,9 +70,9 @@ def judge(sequence: Sequence, labelled: LabelledTracks, cameras: Arrays, config:
     errors, ates = [], []
     for fold in range(folds):
         held_out = static & (part == fold)
-        scene = bundle_adjustment_step(sequence, without(labelled, held_out), cameras, config, Hooks()).arrays
+        scene = bundle_adjustment_step(sequence, labelled.without(held_out), cameras, config, Hooks()).arrays
         kept = replace(sequence, intrinsics=scene["intrinsics"])
-        judges = without(labelled, static & ~held_out)
+        judges = labelled.without(static & ~held_out)
         errors.append(reprojection_errors(judges, bundle_adjustment_step(kept, judges, scene, frozen, Hooks()).arrays))
         truth = sequence.ground_truth.world_T_cam
         if truth is not None:

@@ -1,4 +1,4 @@
-"""Array types and the namespace switch that lets one residual serve NumPy and torch."""
+"""Array types, the namespace switch that lets one residual serve NumPy and torch, and evenly spread indices."""
 
 from __future__ import annotations
 
@@ -22,3 +22,8 @@ Array: TypeAlias = Any
 def namespace(array: Array) -> Any:
     """Return the array-API namespace (NumPy or torch) that ``array`` belongs to."""
     return array_api_compat.array_namespace(array)
+
+
+def evenly_spread(count: int, limit: int) -> IntArray:
+    """Return up to ``limit`` of the indices 0 .. count - 1, evenly spread, ascending, first and last among them."""
+    return np.linspace(0, count - 1, min(count, limit)).astype(np.int64)

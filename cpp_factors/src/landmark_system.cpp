@@ -394,7 +394,6 @@ StepSums LandmarkSystem::back_substitute(const double* camera_step, double* land
         }
         solve_lower(factors_.data() + 6 * row, x);
         solve_upper(factors_.data() + 6 * row, x);
-        constexpr int kDiagonal[3] = {0, 3, 5};
         for (std::size_t j = 0; j < 3; ++j) {
           landmark_step[3 * row + j] = -x[j];
           own.slope -= landmark[6 + j] * x[j];

@@ -78,7 +78,6 @@ bool TrajectorySystem::factorize_chunk(int chunk, double damping, double min_dia
     const double* before_that = rows[(p + 1) % 3];
     double s[6];
     std::copy_n(block, 6, s);
-    constexpr int kDiagonal[3] = {0, 3, 5};
     for (int a = 0; a < 3; ++a) {
       const double added = damping * std::min(std::max(block[kDiagonal[a]], min_diagonal), max_diagonal);
       added_[3 * p + static_cast<std::size_t>(a)] = added;

@@ -46,6 +46,14 @@ UNI4D_FG_INLINE void add_square(double scale, const double* a, double* block) {
   for (int i = 0; i < 6; ++i) block[i] += scale * a[kRowOf[i]] * a[kColumnOf[i]];
 }
 
+/// Take what a robust kernel's falloff removes along the residual from a stiffness: `pull` is the gradient of a factor,
+/// `robust` its weight, `squared` its whitened squared norm.
+UNI4D_FG_INLINE void soften(double kernel_curvature, const Kernel& kernel, double robust, double squared,
+                            const double* pull, double* stiffness) {
+  const double softening = kernel_curvature * falloff(kernel, squared);
+  if (softening * robust > 0.0) add_square(-softening / (robust * squared), pull, stiffness);
+}
+
 int num_ranges(std::size_t count) { return static_cast<int>((count + kRangeSize - 1) / kRangeSize); }
 
 }  // namespace
@@ -253,8 +261,7 @@ void TrajectorySystem::linearize_inside(const Batch& batch, int batch_index, int
       add_square(scale, jacobian + 3 * a, &inside_[18 * row]);
     }
     for (std::size_t k = 0; k < 3; ++k) gradient_[3 * row + k] += pull[k];
-    const double softening = kernel_curvature * falloff(batch.kernel, squared);
-    if (softening * robust > 0.0) add_square(-softening / (robust * squared), pull, &inside_[18 * row]);
+    soften(kernel_curvature, batch.kernel, robust, squared, pull, &inside_[18 * row]);
   }
 }
 
@@ -267,13 +274,11 @@ void TrajectorySystem::linearize_smoothness(const Batch& batch, std::size_t n, d
   for (int a = 0; a < 3; ++a) squared += r[a] * inverse_sigma[a] * r[a] * inverse_sigma[a];
   const double robust = batch.weight[n] * weight(batch.kernel, squared);
   std::fill_n(stiffness, 6, 0.0);
-  constexpr int kDiagonal[3] = {0, 3, 5};
   for (int a = 0; a < 3; ++a) {
     stiffness[kDiagonal[a]] = robust * inverse_sigma[a] * inverse_sigma[a];
     pull[a] = stiffness[kDiagonal[a]] * r[a];
   }
-  const double softening = kernel_curvature * falloff(batch.kernel, squared);
-  if (softening * robust > 0.0) add_square(-softening / (robust * squared), pull, stiffness);
+  soften(kernel_curvature, batch.kernel, robust, squared, pull, stiffness);
 }
 
 /// Copy what factors within a track gave to the blocks of a chunk, and add the part of ARAP.

@@ -21,11 +21,9 @@ class StageRatio:
     stage: str
     start: str
     opponent: str
-    time: float
-    """LM's time to the opponent's final energies over the opponent's own; infinite if there is a task in which it
-    never got there."""
     spent: float
-    """The same where such a task counts with LM's whole time."""
+    """LM's time to the opponent's final energies over the opponent's own; a task in which it never got there counts
+    with all of LM's time."""
     missed: int
     """Number of those tasks."""
     tasks: int
@@ -33,6 +31,11 @@ class StageRatio:
     """The opponent's time to LM's final energies over LM's own; infinite where it never got there."""
     energy: float
     """LM's final exact energy over the opponent's, the largest of the stage's kinds of solves."""
+
+    @property
+    def time(self) -> float:
+        """``spent``; infinite if there is a task in which LM never got there."""
+        return math.inf if self.missed else self.spent
 
 
 def stage_ratios(comparison: Comparison, opponent: str) -> list[StageRatio]:
@@ -60,7 +63,6 @@ def _ratio(stage: str, start: str, contests: list[Contest], opponent: str) -> St
         stage,
         start,
         opponent,
-        time_ratio(contests, LM, opponent),
         spent_ratio(contests, LM, opponent),
         missed_tasks(contests, LM, opponent),
         sum(contest.tasks for contest in contests),

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array, evenly_spread
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.sequence.frames import LazyFrames
 from uni4d_fg.sequence.model import FrameSource
@@ -129,7 +129,7 @@ def ground_contact(mask: Int32Array, points: SparseInverseDepth, config: Geometr
         columns = np.flatnonzero(lowest.any(axis=0))
         # The lowest pixel of each column in that part.
         line = lines[-1] - np.argmax(lowest[::-1, columns], axis=0)
-        some = np.unique(np.linspace(0, len(columns) - 1, min(len(columns), _MAX_CONTACT_COLUMNS)).astype(np.int64))
+        some = evenly_spread(len(columns), _MAX_CONTACT_COLUMNS)
         uv = np.stack([columns[some], line[some]], axis=1).astype(np.float64)
         out[int(label)] = float(np.median(evaluate(points, uv)))
     return out

@@ -149,7 +149,7 @@ def _tracks_and_cameras(
     cameras, motion = None, None
     for turn in range(_TURNS):
         cameras = solve_cameras(
-            known.without(moving),
+            known.labelled.without(moving),
             intrinsics,
             settings,
             # Among the first, what moves would be explained by a wrong focal length.

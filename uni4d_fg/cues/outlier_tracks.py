@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.arrays import BoolArray, FloatArray, evenly_spread
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static
 from uni4d_fg.geometry.camera import unproject
@@ -53,7 +53,7 @@ def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config
 
 def _majority_pose(points: FloatArray, uv: FloatArray, intrinsics: FloatArray, threshold: float) -> FloatArray | None:
     """Return the pose (4, 4) of the points' camera in the one that sees them at ``uv``; None if none is found."""
-    thin = np.linspace(0, len(points) - 1, min(len(points), _MAX_TRACKS)).astype(np.int64)
+    thin = evenly_spread(len(points), _MAX_TRACKS)
     matrix = intrinsics_matrix(intrinsics)
     try:
         found, rotation, translation, _ = cv2.solvePnPRansac(

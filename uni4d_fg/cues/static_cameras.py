@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
+from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.track_motion import Cameras
 from uni4d_fg.errors import Cancelled, DegenerateProblemError
@@ -48,12 +48,6 @@ class StaticTracks:
             timestamps=video.timestamps,
         )
         return cls(label_tracks(tracks, sequence, config.labels, config.input))
-
-    def without(self, moving: BoolArray) -> LabelledTracks:
-        """Return the labelled tracks with those that move, (K,), rejected."""
-        label = np.where(moving, np.int32(TrackLabel.REJECTED), self.labelled.label).astype(np.int32)
-        weight = np.where(moving[:, None], np.float32(0), self.labelled.weight)
-        return replace(self.labelled, label=label, weight=weight)
 
 
 def solve_cameras(

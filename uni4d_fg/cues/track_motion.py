@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, evenly_spread
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
 from uni4d_fg.tracks.model import LabelledTracks
@@ -177,7 +177,7 @@ def _fit_shared(
     """Fit a quadratic to residuals (n, 2) by iteratively reweighted least squares; None with too few."""
     if len(uv) < _MIN_TRACKS:
         return None
-    thin = np.linspace(0, len(uv) - 1, min(len(uv), _MAX_SHARED_TRACKS)).astype(np.int64)
+    thin = evenly_spread(len(uv), _MAX_SHARED_TRACKS)
     height, width = size
     terms = np.stack(
         _quadratic((uv[thin, 0] - width / 2) / width, (uv[thin, 1] - height / 2) / width), axis=1

@@ -71,17 +71,7 @@ class Kernel:
         The curvature of the kernel is ``w`` across the residual and ``w (1 - falloff)`` along it, zero where the true
         one would be negative (Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 4.3).
         """
-        c = self.threshold
-        ratio = squared / (c * c)
-        result: FloatArray
-        if self.kind == "quadratic":
-            result = np.zeros_like(squared)
-        elif self.kind == "huber":
-            result = np.where(ratio > 1.0, 1.0, 0.0)
-        elif self.kind == "cauchy":
-            result = np.minimum(2.0 * ratio / (1.0 + ratio), 1.0)
-        else:
-            result = ratio / (1.0 + ratio)
+        result: FloatArray = np.minimum(1.0 - self.slope(squared, 1) / self.weight(squared), 1.0)
         return result
 
     def slope(self, squared: FloatArray, dim: int) -> FloatArray:

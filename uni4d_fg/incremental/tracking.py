@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import Float32Array, ImageArray, IntArray
+from uni4d_fg.arrays import Float32Array, ImageArray, IntArray, evenly_spread
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.incremental.model import FrameTracks
 from uni4d_fg.tracks.lucas_kanade import query_grid
@@ -56,7 +56,7 @@ class OnlineTracker:
             grid = grid[distance > spacing]
         room = max(self.max_tracks - len(self.points), 0)
         if len(grid) > room:
-            grid = grid[np.linspace(0, len(grid) - 1, room).astype(np.int64)]
+            grid = grid[evenly_spread(len(grid), room)]
         self.track = np.concatenate([self.track, self.next_track + np.arange(len(grid), dtype=np.int64)])
         self.points = np.concatenate([self.points, grid])
         self.next_track += len(grid)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, evenly_spread
 from uni4d_fg.evaluate.alignment import align_trajectories
 from uni4d_fg.reconstruction.pictures.figure import upright_axes
 from uni4d_fg.report.chart import Line, line_chart, nice_ticks, svg
@@ -85,7 +85,7 @@ def _plan(
         line = "M" + "L".join("{:.1f} {:.1f}".format(*at(point)) for point in truth)
         dashes: dict[str, str | float] = {"stroke": "currentColor", "stroke_dasharray": "5 3", "stroke_width": 1.2}
         parts.append(element("path", d=line, fill="none", **dashes))
-    kept = np.unique(np.linspace(0, len(path) - 1, min(len(path), _MAX_SEGMENTS)).astype(int))
+    kept = evenly_spread(len(path), _MAX_SEGMENTS)
     colors = matplotlib.colormaps["viridis"](kept / max(len(path) - 1, 1))[:, :3]
     for first, second, color in zip(kept[:-1], kept[1:], colors, strict=False):
         (x1, y1), (x2, y2) = at(path[first]), at(path[second])

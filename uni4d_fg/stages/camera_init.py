@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.stages import CameraInitConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch, Slot
@@ -72,7 +72,7 @@ class PairSource:
         if (source, target) not in self._tracks:
             common = np.flatnonzero(self.liftable[source] & self.seen[target])
             if self.max_tracks and len(common) > self.max_tracks:
-                common = common[np.linspace(0, len(common) - 1, self.max_tracks).astype(np.int64)]
+                common = common[evenly_spread(len(common), self.max_tracks)]
             self._tracks[source, target] = common
         return self._tracks[source, target]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, evenly_spread
 from uni4d_fg.stages.noise import robust_sigma
 from uni4d_fg.stages.observations import Observations
 
@@ -66,7 +66,7 @@ def predict_log_scale(
         if len(known) <= neighbours:
             continue
         tree, values = cKDTree(static.uv[known]), deviation[known]
-        sample = np.linspace(0, len(known) - 1, min(len(known), _SAMPLE)).astype(np.int64)
+        sample = evenly_spread(len(known), _SAMPLE)
         _, near = tree.query(static.uv[known[sample]], k=neighbours + 1)
         errors.append(values[sample] - np.median(values[near[:, 1:]], axis=1))
         if len(mine):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -89,3 +89,8 @@ class LabelledTracks:
     def counts(self) -> dict[str, int]:
         """Return the number of tracks per label name."""
         return {label.name.lower(): int((self.label == label).sum()) for label in TrackLabel}
+
+    def without(self, rejected: BoolArray) -> LabelledTracks:
+        """Return the same tracks with some of them, (K,), rejected."""
+        label = np.where(rejected, np.int32(TrackLabel.REJECTED), self.label).astype(np.int32)
+        return replace(self, label=label, weight=np.where(rejected[:, None], np.float32(0), self.weight))

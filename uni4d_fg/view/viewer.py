@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.arrays import IntArray
+from uni4d_fg.arrays import evenly_spread
 from uni4d_fg.reconstruction.pictures.figure import upright_axes
 from uni4d_fg.view.coloring import ColorBy, Coloring, values_of
 from uni4d_fg.view.content import Limits, RunClouds
@@ -45,9 +45,9 @@ class Viewer:
         self._shown = Shown(landmarks=source == "none")
         self._coloring = Coloring(ColorBy.image, run, self._values)
         size = _POINT_SIZE * self._depth
-        rows = _spread(len(reconstruction.landmarks), limits.landmarks)
+        rows = evenly_spread(len(reconstruction.landmarks), limits.landmarks)
         self._points = PointLayers(server, run, clouds, static, rows, size)
-        tracks = _spread(len(reconstruction.dynamic_points), limits.trajectories)
+        tracks = evenly_spread(len(reconstruction.dynamic_points), limits.trajectories)
         self._trajectories = TrajectoryLayer(server, run, tracks, size)
         self._cameras = CameraLayer(server, run, limits, _CAMERA_SIZE * self._depth)
         times = np.diff(reconstruction.timestamps)
@@ -181,11 +181,6 @@ class Viewer:
 
 def _still(shown: Shown) -> tuple[bool, bool, float]:
     return shown.static, shown.landmarks, shown.point_size
-
-
-def _spread(count: int, limit: int) -> IntArray:
-    """Return up to ``limit`` of ``count`` rows, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.int64)) if count else np.zeros(0, np.int64)
 
 
 def _notes(run: OpenedRun, source: str, limits: Limits) -> str:

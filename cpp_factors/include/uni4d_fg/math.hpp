@@ -75,6 +75,9 @@ UNI4D_FG_INLINE Mat3 transposed(const Mat3& a) {
   return {{a(0, 0), a(1, 0), a(2, 0), a(0, 1), a(1, 1), a(2, 1), a(0, 2), a(1, 2), a(2, 2)}};
 }
 
+/// Places of the diagonal in the six values of a symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz.
+constexpr int kDiagonal[3] = {0, 3, 5};
+
 /// out += S v for a symmetric 3x3 matrix of six values: xx, xy, xz, yy, yz, zz.
 UNI4D_FG_INLINE void add_symmetric_product(const double* s, const double* v, double* out) {
   out[0] += s[0] * v[0] + s[1] * v[1] + s[2] * v[2];

@@ -194,7 +194,7 @@ class TrajectorySystem {
   std::vector<double> gradient_;      ///< (3 P)
   std::vector<double> inside_;        ///< (P, 18) J^T J of factors within a track: block, lag 1, lag 2, all symmetric.
   std::vector<double> blocks_;        ///< (P, 24) all of J^T J within a track: block, lag 1, lag 2.
-  std::vector<double> loose_stiffness_; ///< Smoothness beyond the bands: symmetric stiffness (factors, 6).
+  std::vector<double> loose_stiffness_;  ///< Smoothness beyond the bands: symmetric stiffness (factors, 6).
   std::vector<double> added_;         ///< (3 P) damping.
   std::vector<float> factor_;         ///< (P, 24) Cholesky: inverse of the diagonal block, lags 1 and 2.
 };

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.structure.two_view import parallax
 from uni4d_fg.stages.observations import Observations
@@ -61,7 +61,7 @@ def rank_pairs(
         config: Thresholds.
         known_focal: Whether the focal lengths are exact.
     """
-    sampled = np.unique(np.linspace(0, num_frames - 1, min(num_frames, _SAMPLED_FRAMES)).astype(np.int64)).tolist()
+    sampled = evenly_spread(num_frames, _SAMPLED_FRAMES).tolist()
     common_tracks = CommonTracks(observations, num_frames)
     pairs = []
     for position, first in enumerate(sampled):
@@ -69,7 +69,7 @@ def rank_pairs(
             a, b = common_tracks.between(first, second)
             if len(a) < config.min_common_tracks:
                 break  # tracks only get fewer
-            used = np.unique(np.linspace(0, len(a) - 1, min(len(a), _FITTED_TRACKS)).astype(np.int64))
+            used = evenly_spread(len(a), _FITTED_TRACKS)
             moved = parallax(observations.uv[a[used]], observations.uv[b[used]], intrinsics, known_focal=known_focal)
             pairs.append(FramePair(first, second, moved, len(a)))
     return sorted(pairs, key=lambda pair: -_worth(pair, config))

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.patheffects import Normal, Stroke
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray
+from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, evenly_spread
 from uni4d_fg.reconstruction.model import Reconstruction
 from uni4d_fg.reconstruction.pictures.figure import INK, MUTED, new_figure, save_figure, spread_frames, upright_axes
 from uni4d_fg.reconstruction.pictures.splatting import View, look_at, render
@@ -136,11 +136,11 @@ def _framed(world_T_cam: FloatArray, clouds: list[FloatArray], cameras: FloatArr
 def _trails(reconstruction: Reconstruction) -> tuple[FloatArray, FloatArray]:
     """Return up to _MAX_TRAILS trajectories (M, T, 3) and their RGB (M, 3), neighbours in like colours."""
     points = reconstruction.dynamic_points
-    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MAX_TRAILS)).astype(int))
+    chosen = evenly_spread(len(points), _MAX_TRAILS)
     points = points[chosen]
     if not len(points):
         return points, np.zeros((0, 3))
-    known = np.isfinite(points).all(axis=2)
+    known = np.asarray(np.isfinite(points).all(axis=2))
     mean = np.where(known[..., None], points, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
     spread = mean - mean.mean(axis=0)
     main = np.linalg.svd(spread, full_matrices=False)[2][0]

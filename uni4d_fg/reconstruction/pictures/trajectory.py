@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import MaxNLocator
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, evenly_spread
 from uni4d_fg.evaluate.alignment import align_trajectories
 from uni4d_fg.evaluate.trajectory import evaluate_trajectory
 from uni4d_fg.reconstruction.pictures.figure import GRID, INK, MUTED, new_figure, save_figure, upright_axes
@@ -93,7 +93,7 @@ def _style(panel: Axes, name: str, label_x: str, label_y: str) -> None:
 def _draw_path(panel: Axes, points: FloatArray, direction: FloatArray, arrow: float) -> LineCollection | None:
     """Draw one projected path (T, 2), coloured by frame, with the viewing direction of some frames."""
     count = len(points)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _VIEW_ARROWS)).astype(int))
+    chosen = evenly_spread(count, _VIEW_ARROWS)
     rays = np.stack((points[chosen], points[chosen] + arrow * direction[chosen]), axis=1)
     panel.add_collection(LineCollection(list(rays), colors=MUTED, linewidths=0.9, zorder=2))
     panel.plot(points[0, 0], points[0, 1], "o", color=INK, markersize=5, zorder=4, label="first frame")
