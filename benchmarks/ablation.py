@@ -17,17 +17,18 @@ from pathlib import Path
 import numpy as np
 
 from uni4d_fg.config.load import load_config
-from uni4d_fg.evaluate.alignment import align_trajectories
-from uni4d_fg.evaluate.run import evaluate_run
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.synthetic import CueNoise, SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.frontend.track_model import TrackLabel
+from uni4d_fg.geometry.alignment import align_trajectories
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.reconstruction.io import load_reconstruction
-from uni4d_fg.reconstruction.labels_io import load_labels
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.stages.lifting import lift
-from uni4d_fg.stages.observations import observations_of
-from uni4d_fg.synthetic import CueNoise, SyntheticSceneConfig, make_synthetic_sequence
-from uni4d_fg.tracks.model import TrackLabel
+from uni4d_fg.results.evaluate.run import evaluate_run
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.stages.lifting import lift
+from uni4d_fg.slam.stages.observations import observations_of
+from uni4d_fg.slam.stages.scene import Cameras
 
 QUIET = ["output.clouds=false", "output.pictures=false"]
 VARIANTS: dict[str, tuple[str, list[str]]] = {
@@ -50,7 +51,8 @@ def raw_lift_error(run_dir: Path, sequence: Sequence) -> float:
     assert truth.world_T_cam is not None
     assert truth.track_points is not None
     observations = observations_of(labelled, TrackLabel.DYNAMIC)
-    points = lift(observations, result.world_T_cam, result.intrinsics, np.zeros(result.num_frames))
+    cameras = Cameras(result.world_T_cam, result.intrinsics, np.zeros(result.num_frames))
+    points = lift(observations, cameras)
     aligned = align_trajectories(result.world_T_cam, truth.world_T_cam).apply(points)
     error = np.linalg.norm(aligned - truth.track_points[observations.track, observations.frame], axis=1)
     return float(np.sqrt(np.nanmean(error**2)))

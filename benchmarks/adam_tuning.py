@@ -16,16 +16,16 @@ from collections.abc import Iterator
 import numpy as np
 from scenes import PRESETS, SCENES, scene
 
-from uni4d_fg.compare.solvers import Entrant
-from uni4d_fg.compare.task import Task, TaskRecorder
-from uni4d_fg.compare.trace import Trace, trace_solve
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.tracks.labels import label_tracks
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.stage import StageRunner
+from uni4d_fg.pipeline.compare.solvers import SolverVariant
+from uni4d_fg.pipeline.compare.task import Task, TaskRecorder
+from uni4d_fg.pipeline.compare.trace import Trace, trace_solve
 from uni4d_fg.pipeline.steps import bundle_adjustment_step, camera_init_step, nonrigid_step
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.stages.stage import StageRunner
-from uni4d_fg.tracks.labels import label_tracks
 
 STAGES = ("camera_init", "bundle_adjustment", "nonrigid")
 RATES = ("pose_learning_rate", "point_learning_rate", "log_scale_learning_rate", "intrinsics_learning_rate")
@@ -60,7 +60,7 @@ def solves(sequence: Sequence, preset: str, windows: int) -> Iterator[tuple[str,
     config = load_config(preset)
     assert sequence.tracks is not None
     labelled = label_tracks(sequence.tracks, sequence, config.labels, config.input)
-    run, hooks = Entrant("adam", ("solver=adam",)).runner(config), Hooks()
+    run, hooks = SolverVariant("adam", ("solver=adam",)).runner(config), Hooks()
     first, second, third = TaskRecorder(run), TaskRecorder(run), TaskRecorder(run)
     cameras = camera_init_step(sequence, labelled, config, hooks, first).arrays
     yield "camera_init", first.tasks[:windows]
@@ -83,7 +83,7 @@ def iterations_to(traces: list[Trace], goals: list[float]) -> int | None:
 
 
 def runner(preset: str, changes: list[str]) -> StageRunner:
-    return Entrant("variant", ("solver=adam", *changes)).runner(load_config(preset))
+    return SolverVariant("variant", ("solver=adam", *changes)).runner(load_config(preset))
 
 
 def main() -> None:

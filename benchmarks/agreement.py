@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.evaluate.trajectory import evaluate_trajectory
-from uni4d_fg.factors.linear_prior import se3_log
+from uni4d_fg.frontend.sequence.read import read_sequence
 from uni4d_fg.geometry import se3
-from uni4d_fg.reconstruction.io import load_reconstruction
-from uni4d_fg.reconstruction.model import Reconstruction
-from uni4d_fg.sequence.read import read_sequence
+from uni4d_fg.geometry.se3 import se3_log
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.slam.reconstruction import Reconstruction
 
 _JOINT_LIMIT = 20.06
 

@@ -52,14 +52,15 @@ from side_by_side import EQUAL, Times, draw_times, run_apart, run_main, with_mem
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.factors import FactorBatch, Kernel, Slot
-from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.static_reprojection import static_reprojection
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, world_to_camera
-from uni4d_fg.graph.problem import Problem
-from uni4d_fg.graph.state import State
-from uni4d_fg.solve.levenberg_marquardt import minimize
-from uni4d_fg.solve.objective import Objective
-from uni4d_fg.solve.schur import SchurObjective
+from uni4d_fg.optim.levenberg_marquardt import minimize
+from uni4d_fg.optim.objective import Objective
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.schur import SchurObjective
 
 SOLVERS = ("cpp", "python", "gtsam", "ceres-sparse", "ceres-dense")
 THRESHOLD = 1.345
@@ -92,9 +93,9 @@ def make_problem(observations: int, seed: int = 0) -> tuple[Problem, State]:
     disturbance[[0, -1]] = 0.0
     state = State(
         {
-            "pose": se3.retract(poses, disturbance),
-            "intrinsics": K[None] * 1.03,
-            "landmark": points * (1.0 + rng.normal(scale=0.05, size=(count, 1))),
+            POSE: se3.retract(poses, disturbance),
+            INTRINSICS: K[None] * 1.03,
+            LANDMARK: points * (1.0 + rng.normal(scale=0.05, size=(count, 1))),
         }
     )
     return adjustment(state, frame, row, uv), state
@@ -102,27 +103,27 @@ def make_problem(observations: int, seed: int = 0) -> tuple[Problem, State]:
 
 def bal_problem(file: BalProblem) -> tuple[Problem, State]:
     """Return a file's problem, started where the file does."""
-    state = State({"pose": file.world_T_cam, "intrinsics": file.intrinsics[None], "landmark": file.points})
+    state = State({POSE: file.world_T_cam, INTRINSICS: file.intrinsics[None], LANDMARK: file.points})
     return adjustment(state, file.camera, file.point, file.uv), state
 
 
 def adjustment(state: State, frame: IntArray, row: IntArray, uv: FloatArray) -> Problem:
     """Return the problem of observations (M, 2) of landmarks (M,) in frames (M,): first and last pose fixed."""
-    slots = (Slot("pose", frame), Slot("landmark", row), Slot("intrinsics", np.zeros(len(row), dtype=np.int64)))
-    batch = FactorBatch.create(STATIC_REPROJECTION, slots, {"uv": uv}, kernel=Kernel("huber", THRESHOLD))
+    slots = (Slot(POSE, frame), Slot(LANDMARK, row), Slot(INTRINSICS, np.zeros(len(row), dtype=np.int64)))
+    batch = FactorBatch.create(static_reprojection, slots, {"uv": uv}, kernel=Kernel("huber", THRESHOLD))
     free = {
-        "landmark": np.ones((len(state["landmark"]), 3), dtype=bool),
-        "pose": np.ones((len(state["pose"]), 6), dtype=bool),
-        "intrinsics": np.ones((1, 4), dtype=bool),
+        LANDMARK: np.ones((len(state[LANDMARK]), 3), dtype=bool),
+        POSE: np.ones((len(state[POSE]), 6), dtype=bool),
+        INTRINSICS: np.ones((1, 4), dtype=bool),
     }
-    free["pose"][[0, -1]] = False
+    free[POSE][[0, -1]] = False
     return Problem((batch,), free)
 
 
 def solve_ours(problem: Problem, state: State, threads: int, cpp: bool) -> dict[str, float]:
     config = SolverConfig(relative_decrease=TOLERANCE, max_iterations=MAX_ITERATIONS)
     if cpp:
-        from uni4d_fg.solve.cpp_schur import CppSchurObjective
+        from uni4d_fg.optim.cpp_schur import CppSchurObjective
 
     began = time.perf_counter()
     objective: Objective[State]
@@ -145,34 +146,30 @@ def solve_ours(problem: Problem, state: State, threads: int, cpp: bool) -> dict[
 def solve_gtsam(problem: Problem, state: State, threads: int) -> dict[str, float]:
     import gtsam
 
-    from uni4d_fg.graph import keys
-
     (batch,) = problem.batches
     graph = gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Robust.Create(
         gtsam.noiseModel.mEstimator.Huber.Create(THRESHOLD), gtsam.noiseModel.Unit.Create(2)
     )
     pose, landmark, _ = (s.rows.tolist() for s in batch.slots)
-    intrinsics = keys.intrinsics_key()
+    poses, landmarks, intrinsics = state.keys(POSE), state.keys(LANDMARK), state.key(INTRINSICS, 0)
     for uv, frame, row in zip(batch.data["uv"], pose, landmark, strict=True):
-        graph.push_back(
-            gtsam.GeneralSFMFactor2Cal3_S2(uv, noise, keys.pose_key(frame), keys.landmark_key(row), intrinsics)
-        )
-    fx, fy, cx, cy = state["intrinsics"][0]
+        graph.push_back(gtsam.GeneralSFMFactor2Cal3_S2(uv, noise, poses[frame], landmarks[row], intrinsics))
+    fx, fy, cx, cy = state[INTRINSICS][0]
     skew = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e6, 1e6, 1e-6, 1e6, 1e6]))
     graph.push_back(gtsam.PriorFactorCal3_S2(intrinsics, gtsam.Cal3_S2(fx, fy, 0.0, cx, cy), skew))
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-    last = len(state["pose"]) - 1
+    last = len(state[POSE]) - 1
     for frame in (0, last):
-        graph.push_back(gtsam.PriorFactorPose3(keys.pose_key(frame), gtsam.Pose3(state["pose"][frame]), tight))
+        graph.push_back(gtsam.PriorFactorPose3(poses[frame], gtsam.Pose3(state[POSE][frame]), tight))
     values = gtsam.Values()
     ordering = gtsam.Ordering()
-    for row, point in enumerate(state["landmark"]):
-        values.insert(keys.landmark_key(row), point)
-        ordering.push_back(keys.landmark_key(row))
-    for frame, matrix in enumerate(state["pose"]):
-        values.insert(keys.pose_key(frame), gtsam.Pose3(matrix))
-        ordering.push_back(keys.pose_key(frame))
+    for row, point in enumerate(state[LANDMARK]):
+        values.insert(landmarks[row], point)
+        ordering.push_back(landmarks[row])
+    for frame, matrix in enumerate(state[POSE]):
+        values.insert(poses[frame], gtsam.Pose3(matrix))
+        ordering.push_back(poses[frame])
     values.insert(intrinsics, gtsam.Cal3_S2(fx, fy, 0.0, cx, cy))
     ordering.push_back(intrinsics)
     parameters = gtsam.LevenbergMarquardtParams()
@@ -195,23 +192,23 @@ def solve_ceres(problem: Problem, state: State, threads: int, kind: str) -> dict
     (batch,) = problem.batches
     pose, landmark = batch.slots[0].rows, batch.slots[1].rows
     scene = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(model="PINHOLE", width=960, height=540, params=state["intrinsics"][0], camera_id=1)
+    camera = pycolmap.Camera(model="PINHOLE", width=960, height=540, params=state[INTRINSICS][0], camera_id=1)
     scene.add_camera_with_trivial_rig(camera)
     order = np.argsort(pose, kind="stable")
-    start = np.searchsorted(pose[order], np.arange(len(state["pose"]) + 1))
+    start = np.searchsorted(pose[order], np.arange(len(state[POSE]) + 1))
     place = np.empty(len(pose), dtype=np.int64)
     config = pycolmap.BundleAdjustmentConfig()
-    for frame, matrix in enumerate(state["pose"]):
+    for frame, matrix in enumerate(state[POSE]):
         rows = order[start[frame] : start[frame + 1]]
         place[rows] = np.arange(len(rows))
         image = pycolmap.Image(name=str(frame), keypoints=batch.data["uv"][rows], camera_id=1, image_id=frame + 1)
         scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(matrix)[:3]))
         config.add_image(frame + 1)
-    for frame in (0, len(state["pose"]) - 1):
+    for frame in (0, len(state[POSE]) - 1):
         config.set_constant_rig_from_world_pose(frame + 1)
     by_landmark = np.argsort(landmark, kind="stable")
-    first = np.searchsorted(landmark[by_landmark], np.arange(len(state["landmark"]) + 1))
-    for row, point in enumerate(state["landmark"]):
+    first = np.searchsorted(landmark[by_landmark], np.arange(len(state[LANDMARK]) + 1))
+    for row, point in enumerate(state[LANDMARK]):
         elements = [
             pycolmap.TrackElement(int(pose[n]) + 1, int(place[n])) for n in by_landmark[first[row] : first[row + 1]]
         ]
@@ -260,8 +257,8 @@ def run_here(solver: str, size: int | Path, threads: int) -> None:
     """Solve once in this process and print the result as JSON."""
     problem, state = problem_of(size)
     result: dict[str, Any] = with_memory(lambda: RUN[solver](problem, state, threads))
-    result |= {"observations": len(problem.batches[0]), "landmarks": len(state["landmark"])}
-    result["frames"] = len(state["pose"])
+    result |= {"observations": len(problem.batches[0]), "landmarks": len(state[LANDMARK])}
+    result["frames"] = len(state[POSE])
     print(json.dumps(result))
 
 
@@ -279,7 +276,7 @@ def measured(size: int | Path, solvers: list[str], threads: int, repeats: int) -
 
 def roofline(size: int | Path) -> None:
     """Print what the C++ passes take per observation, and what memory and arithmetic allow."""
-    from uni4d_fg.solve.cpp_schur import CppSchurObjective
+    from uni4d_fg.optim.cpp_schur import CppSchurObjective
 
     def fastest(call: Callable[[], object], clock: Callable[[], float] = time.process_time) -> float:
         times = []

@@ -27,18 +27,18 @@ from typing import Any
 from side_by_side import EQUAL, Times, draw_times, run_apart, run_main, with_memory
 
 from uni4d_fg.config.load import load_config
-from uni4d_fg.graph.state import State
+from uni4d_fg.factors.state import State
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.frontend.tracks.labels import label_tracks
+from uni4d_fg.optim.backend import choose_backend
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.stage import LevenbergMarquardtRunner, Stage
+from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.pipeline.steps import camera_init_step
-from uni4d_fg.solve.backend import choose_backend
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.solve.summary import SolveSummary
-from uni4d_fg.stages.stage import LevenbergMarquardtRunner, Stage
-from uni4d_fg.synthetic import SyntheticSceneConfig, make_synthetic_sequence
-from uni4d_fg.tracks.labels import label_tracks
 
 SOLVERS = ("cpp", "python", "gtsam")
 PRESETS = ("default", "paper")
-MODULES = {"cpp": "uni4d_fg.solve.cpp_pairs", "gtsam": "uni4d_fg.solve.gtsam_objective"}
+MODULES = {"cpp": "uni4d_fg.optim.cpp_pairs", "gtsam": "uni4d_fg.optim.gtsam_objective"}
 """What a solver loads when it is first used."""
 PHASES = ("linearize", "solve", "evaluate")
 

@@ -22,12 +22,12 @@ from pathlib import Path
 
 from scenes import PRESETS, SCENES, scene
 
-from uni4d_fg.compare.comparison import Comparison, Effort, compare_sequence
-from uni4d_fg.compare.machine import machine
-from uni4d_fg.compare.report import draw_comparison, write_report
-from uni4d_fg.compare.solvers import ADAM, LM, entrants
-from uni4d_fg.compare.verdict import stage_ratios
 from uni4d_fg.config.load import load_config
+from uni4d_fg.pipeline.compare.comparison import Budget, Comparison, compare_sequence
+from uni4d_fg.pipeline.compare.machine import machine
+from uni4d_fg.pipeline.compare.ratios import stage_ratios
+from uni4d_fg.pipeline.compare.report import draw_comparison, write_report
+from uni4d_fg.pipeline.compare.solvers import ADAM, LM, solver_variants
 from uni4d_fg.progress import SilentReporter
 
 BASELINE = Path(__file__).with_name("compare_baseline.json")
@@ -45,7 +45,7 @@ class LineReporter(SilentReporter):
 
 
 def compare_scene(
-    name: str, out: Path, effort: Effort, variants: list[str], changes: list[str], resume: bool
+    name: str, out: Path, budget: Budget, variants: list[str], changes: list[str], resume: bool
 ) -> list[Comparison]:
     sequence = scene(name)
     done = []
@@ -54,7 +54,7 @@ def compare_scene(
         folder = out / name / preset
         config = load_config(preset, [*QUIET, *changes])
         comparison = compare_sequence(
-            sequence, preset, config, entrants(variants), folder, effort, resume=resume, reporter=LineReporter()
+            sequence, preset, config, solver_variants(variants), folder, budget, resume=resume, reporter=LineReporter()
         )
         comparison = Comparison(**{**vars(comparison), "sequence": name})
         draw_comparison(folder, sequence, comparison, folder)
@@ -119,8 +119,8 @@ def main() -> None:
     done: list[Comparison] = []
     command = " ".join(["python benchmarks/compare.py --scenes", *scenes, *(f"--set {c}" for c in arguments.set)])
     for name in scenes:
-        effort = Effort(arguments.repeats, arguments.budget)
-        done += compare_scene(name, arguments.out, effort, arguments.variant, arguments.set, arguments.resume)
+        budget = Budget(arguments.repeats, arguments.budget)
+        done += compare_scene(name, arguments.out, budget, arguments.variant, arguments.set, arguments.resume)
         write_report(arguments.out, done, machine(), command)
     measured = list(figures(done))
     for name, _, value in measured:

@@ -21,17 +21,17 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
-from uni4d_fg.evaluate.trajectory import evaluate_trajectory
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.read import read_sequence
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.optim.cluster_robust import image_cells
+from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step
-from uni4d_fg.reconstruction.labels_io import load_labels
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.sequence.read import read_sequence
-from uni4d_fg.solve.clustered import image_cells
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.stages.observations import observations_of
-from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.stages.observations import observations_of
 
 STATIC = (TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
 CELLS = 5

@@ -40,17 +40,18 @@ from side_by_side import Times, draw_times, run_apart, run_main, with_memory
 
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.config.stages import NonRigidConfig
-from uni4d_fg.factors.custom_factor import to_factor_graph
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, world_to_camera
-from uni4d_fg.graph.problem import Problem
-from uni4d_fg.graph.state import State
-from uni4d_fg.solve.levenberg_marquardt import minimize
-from uni4d_fg.solve.objective import Step
-from uni4d_fg.solve.trajectory_cg import TrajectoryLinearization, TrajectoryObjective
-from uni4d_fg.stages.bundle_adjustment import StaticNoise
-from uni4d_fg.stages.nonrigid import FrozenCameras, build_mesh, nonrigid_stage
-from uni4d_fg.stages.observations import Observations
+from uni4d_fg.optim.gtsam_graph import to_gtsam
+from uni4d_fg.optim.levenberg_marquardt import minimize
+from uni4d_fg.optim.objective import Step
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.trajectory_cg import TrajectoryLinearization, TrajectoryObjective
+from uni4d_fg.slam.stages.nonrigid import build_mesh, nonrigid_problem
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
 
 SOLVERS = ("cpp", "python", "gtsam-pcg", "gtsam-metis")
 SOLVER = SolverConfig(max_iterations=30, relative_decrease=1e-4)
@@ -82,10 +83,9 @@ def make_problem(tracks: int, frames: int, neighbours: int, seed: int = 0) -> tu
     k, f = np.nonzero(rng.random((tracks, frames)) >= 0.1)
     seen = Observations(k, f, uv[k, f], depth[k, f], np.ones(len(k)))
     config = NonRigidConfig(neighbours=neighbours)
-    cameras = FrozenCameras(poses, K, np.zeros(frames), StaticNoise(0.5, 0.02))
+    cameras = Cameras(poses, K, np.zeros(frames))
     mesh, seen, rows, state = build_mesh(seen, instance, frames, cameras, config, {})
-    stage = nonrigid_stage(state, mesh, seen, rows, cameras, config, unsquared=False, normalization="mean")
-    return stage.problem, state
+    return nonrigid_problem(state, mesh, seen, rows, cameras, StaticNoise(0.5, 0.02), config), state
 
 
 class GtsamSystems(TrajectoryObjective):
@@ -94,8 +94,8 @@ class GtsamSystems(TrajectoryObjective):
     def __init__(self, problem: Problem, state: State, config: SolverConfig, method: str):
         super().__init__(problem, state, config)
         self.method, self.seconds, self.linearize_seconds = method, 0.0, 0.0
-        self.graph = to_factor_graph(problem, state)
-        self.keys = [state.key("dynamic_point", row) for row in range(len(state["dynamic_point"]))]
+        self.graph, _ = to_gtsam(problem, state, native=False, stacked=False)
+        self.keys = state.keys(DYNAMIC_POINT)
 
     def linearize(self, state: State) -> Any:
         """Return NumPy's model and GTSAM's factors."""
@@ -162,14 +162,14 @@ def run(solver: str, size: str) -> dict[str, Any]:
     """Solve one problem with one solver in this process."""
     problem, state = make_problem(*map(int, size.split("x")))
     result = with_memory(lambda: solve(solver, problem, state))
-    return {**result, "points": len(state["dynamic_point"]), "factors": sum(len(batch) for batch in problem.batches)}
+    return {**result, "points": len(state[DYNAMIC_POINT]), "factors": sum(len(batch) for batch in problem.batches)}
 
 
 def solve(solver: str, problem: Problem, state: State) -> dict[str, Any]:
     """Return cost, iterations and times of one solve."""
     config = SOLVER.model_copy(update={"max_iterations": 1}) if solver == "gtsam-metis" else SOLVER
     if solver == "cpp":
-        from uni4d_fg.solve.cpp_trajectory import CppTrajectoryObjective
+        from uni4d_fg.optim.cpp_trajectory import CppTrajectoryObjective
 
     began = time.perf_counter()
     if solver == "cpp":
@@ -256,10 +256,9 @@ def cholesky(sizes: list[str]) -> None:
         linearization = TrajectoryObjective(problem, state, SOLVER).linearize(state)
         jacobian = linearization._jacobian
         hessian = (jacobian.T @ jacobian + linearization._inside).tocoo()
-        names = state.names.dynamic_track_frame
-        assert names is not None
-        place = np.empty(len(names), dtype=np.int64)
-        place[np.lexsort((names[:, 0], names[:, 1]))] = np.arange(len(names))
+        numbers = state.numbers(DYNAMIC_POINT)
+        place = np.empty(len(numbers), dtype=np.int64)
+        place[np.lexsort(numbers.T)] = np.arange(len(numbers))
         row, column = (3 * place[index // 3] + index % 3 for index in (hessian.row, hessian.col))
         width, n = int(np.abs(row - column).max()), hessian.shape[0]
         band = np.zeros((width + 1, n), order="F")

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.synthetic import SyntheticSceneConfig, make_synthetic_sequence
-from uni4d_fg.tracks.model import Tracks
 
 STAGES = ("camera_init", "bundle_adjustment", "nonrigid", "fusion")
 LIFE = 12

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 
 SCENES = {
     "12x1500": (12, 32, 24),

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from uni4d_fg.compare.memory import PeakMemory
 from uni4d_fg.errors import Uni4dFgError
-from uni4d_fg.reconstruction.pictures.figure import GRID, INK, MUTED, new_figure, save_figure
+from uni4d_fg.pipeline.compare.memory import PeakMemory
+from uni4d_fg.results.pictures.figure import GRID, INK, MUTED, new_figure, save_figure
 
 COLOURS = ("#0b6e4f", "#c8553d", "#3d5a98", "#b58900", "#7b4fa3")
 EQUAL = 1e-6

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from uni4d_fg.config.load import load_config
-from uni4d_fg.incremental import FinishedFrame, FrameTracks, IncrementalReconstructor, Landmarks
-from uni4d_fg.synthetic.hall import HallConfig, given_intrinsics, hall_frames, hall_poses
+from uni4d_fg.frontend.synthetic.hall import HallConfig, given_intrinsics, hall_frames, hall_poses
+from uni4d_fg.slam.incremental import FinishedFrame, FrameTracks, IncrementalReconstructor, Landmarks
 
 
 class Poses:

@@ -33,17 +33,28 @@ Imported import(const AnyArray& argument, const char* name) {
 std::string dtype_name(nb::dlpack::dtype dtype) {
   const char* kind = "dtype";
   switch (static_cast<nb::dlpack::dtype_code>(dtype.code)) {
-    case nb::dlpack::dtype_code::Int: kind = "int"; break;
-    case nb::dlpack::dtype_code::UInt: kind = "uint"; break;
-    case nb::dlpack::dtype_code::Float: kind = "float"; break;
-    case nb::dlpack::dtype_code::Complex: kind = "complex"; break;
-    case nb::dlpack::dtype_code::Bool: return "bool";
-    default: break;
+    case nb::dlpack::dtype_code::Int:
+      kind = "int";
+      break;
+    case nb::dlpack::dtype_code::UInt:
+      kind = "uint";
+      break;
+    case nb::dlpack::dtype_code::Float:
+      kind = "float";
+      break;
+    case nb::dlpack::dtype_code::Complex:
+      kind = "complex";
+      break;
+    case nb::dlpack::dtype_code::Bool:
+      return "bool";
+    default:
+      break;
   }
   return kind + std::to_string(static_cast<int>(dtype.bits));
 }
 
-std::string shape_text(const std::vector<std::int64_t>& shape) {
+template <typename Lengths>
+std::string shape_text(const Lengths& shape) {
   std::string text = "(";
   for (std::size_t i = 0; i < shape.size(); ++i) {
     if (i > 0) text += ", ";
@@ -71,8 +82,7 @@ bool contiguous(const Imported& array) {
 }
 
 template <typename T>
-View<T> expect(const AnyArray& argument, const char* name, const std::vector<std::int64_t>& expected,
-               const char* dtype) {
+View<T> expect(const AnyArray& argument, const char* name, const Shape& expected, const char* dtype) {
   // The values stay alive with the argument itself; the import only looks at them.
   const Imported array = import(argument, name);
   const std::vector<std::int64_t> shape = shape_of(array);
@@ -100,8 +110,7 @@ std::int64_t View<T>::size() const {
 template struct View<double>;
 template struct View<std::int64_t>;
 
-View<double> expect_floats(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape,
-                           bool finite) {
+View<double> expect_floats(const AnyArray& array, const char* name, const Shape& shape, bool finite) {
   View<double> view = expect<double>(array, name, shape, "float64");
   if (finite) {
     const std::int64_t size = view.size();
@@ -114,13 +123,14 @@ View<double> expect_floats(const AnyArray& array, const char* name, std::initial
     if (!(differences[0] + differences[1] + differences[2] + differences[3] == 0.0)) {
       for (i = 0; i < size; ++i)
         if (!std::isfinite(view.data[i]))
-          refuse(std::string(name) + ": every value must be finite; value " + std::to_string(i) + " (flat index) is not");
+          refuse(std::string(name) + ": every value must be finite; value " + std::to_string(i) +
+                 " (flat index) is not");
     }
   }
   return view;
 }
 
-View<std::int64_t> expect_integers(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape) {
+View<std::int64_t> expect_integers(const AnyArray& array, const char* name, const Shape& shape) {
   return expect<std::int64_t>(array, name, shape, "int64");
 }
 

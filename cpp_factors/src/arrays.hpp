@@ -26,6 +26,21 @@ struct AnyArray {
 /// A length that `expect_*` accepts whatever it is.
 constexpr std::int64_t kAnyLength = -1;
 
+/// An expected shape of at most four axes.
+class Shape {
+ public:
+  Shape(std::initializer_list<std::int64_t> lengths) {
+    for (const std::int64_t length : lengths) append(length);
+  }
+  void append(std::int64_t length) { lengths_[size_++] = length; }
+  std::size_t size() const { return size_; }
+  std::int64_t operator[](std::size_t i) const { return lengths_[i]; }
+
+ private:
+  std::int64_t lengths_[4];
+  std::size_t size_ = 0;
+};
+
 /// What is known about an array that passed: a pointer to C-contiguous values and its shape.
 template <typename T>
 struct View {
@@ -41,11 +56,10 @@ std::size_t num_axes(const AnyArray& array, const char* name);
 
 /// Check dtype float64, C-contiguity, shape (kAnyLength leaves an axis open) and, if asked, that all is finite.
 /// Raises ValueError "name: expected float64 (N, 2) C-contiguous, got float32 (5, 2)".
-View<double> expect_floats(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape,
-                           bool finite = true);
+View<double> expect_floats(const AnyArray& array, const char* name, const Shape& shape, bool finite = true);
 
 /// Check dtype int64, C-contiguity and shape.
-View<std::int64_t> expect_integers(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape);
+View<std::int64_t> expect_integers(const AnyArray& array, const char* name, const Shape& shape);
 
 /// Check dtype int64, C-contiguity, shape (n,) and that every entry lies in [0, limit).
 View<std::int64_t> expect_rows(const AnyArray& array, const char* name, std::int64_t length, std::int64_t limit);

@@ -1,8 +1,10 @@
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <limits>
 #include <memory>
+#include <optional>
 #include <tuple>
 
 #include "arrays.hpp"
@@ -22,7 +24,7 @@ LandmarkBatch read_batch(const BatchArguments& arguments, const LandmarkProblem&
   batch.count = pose_view.rows();
   batch.pose = pose_view.data;
   batch.landmark = expect_rows(landmark, "landmark", batch.count, problem.num_landmarks).data;
-  // What is measured may be NaN or infinite: the linearisation reports it.
+  // What is measured may be NaN or infinite: the linearization reports it.
   batch.measured = depth ? expect_floats(measured, "depth", {batch.count}, false).data
                          : expect_floats(measured, "uv", {batch.count, 2}, false).data;
   const Sigma checked = expect_sigma(sigma, "sigma", batch.count, depth ? 1 : 2);
@@ -114,6 +116,35 @@ class BoundLandmarkSystem {
     return nb::make_tuple(blocks.release(), gradients.release());
   }
 
+  double add_to_landmarks(const AnyArray& rows, const AnyArray& blocks, const AnyArray& gradients) {
+    expect_linearized();
+    const auto landmarks = expect_free_landmarks(rows);
+    const double* block_data = expect_floats(blocks, "blocks", {landmarks.rows(), 3, 3}).data;
+    const double* gradient_data = expect_floats(gradients, "gradients", {landmarks.rows(), 3}).data;
+    nb::gil_scoped_release release;
+    return system_->add_to_landmarks(landmarks.rows(), landmarks.data, block_data, gradient_data);
+  }
+
+  nb::object whitened_coupling(const AnyArray& rows) {
+    if (!system_->reduced()) refuse("whitened_coupling: call reduce first");
+    const auto landmarks = expect_free_landmarks(rows);
+    const auto width = static_cast<std::size_t>(system_->problem().num_columns) + kBorder + 1;
+    NewArray out({static_cast<std::size_t>(landmarks.rows()), 3, width});
+    {
+      nb::gil_scoped_release release;
+      system_->whitened_coupling(landmarks.rows(), landmarks.data, out.data());
+    }
+    return nb::cast(out.release());
+  }
+
+  nb::object inverse_factors(const AnyArray& rows) const {
+    if (!system_->reduced()) refuse("inverse_factors: call reduce first");
+    const auto landmarks = expect_free_landmarks(rows);
+    NewArray out({static_cast<std::size_t>(landmarks.rows()), 3, 3});
+    system_->inverse_factors(landmarks.rows(), landmarks.data, out.data());
+    return nb::cast(out.release());
+  }
+
   nb::object reduce(double damping, double min_diagonal, double max_diagonal, const AnyArray& core,
                     const AnyArray& border, const AnyArray& corner, const AnyArray& gradient) {
     expect_linearized();
@@ -141,15 +172,16 @@ class BoundLandmarkSystem {
     return nb::make_tuple(out.core.release(), out.border.release(), out.corner.release(), out.gradient.release());
   }
 
-  nb::tuple back_substitute(const AnyArray& camera_step) const {
+  nb::tuple back_substitute(const AnyArray& camera_step, const std::optional<AnyArray>& extra) const {
     if (!system_->reduced()) refuse("back_substitute: call reduce first");
     const LandmarkProblem& problem = system_->problem();
     const auto step = expect_floats(camera_step, "camera_step", {problem.num_columns + kBorder}, false);
+    const double* extra_data = extra ? expect_floats(*extra, "extra", {problem.num_landmarks, 3}, false).data : nullptr;
     NewArray out({static_cast<std::size_t>(problem.num_landmarks), 3});
     StepSums sums;
     {
       nb::gil_scoped_release release;
-      sums = system_->back_substitute(step.data, out.data());
+      sums = system_->back_substitute(step.data, extra_data, out.data());
     }
     return nb::make_tuple(out.release(), sums.slope, sums.damped, sums.squared);
   }
@@ -177,6 +209,17 @@ class BoundLandmarkSystem {
             expect_floats(landmarks, "landmarks", {problem.num_landmarks, 3}, false).data};
   }
 
+  /// Check rows of landmarks: in range and free.
+  View<std::int64_t> expect_free_landmarks(const AnyArray& rows) const {
+    const LandmarkProblem& problem = system_->problem();
+    const auto view = expect_rows(rows, "rows", kAnyLength, problem.num_landmarks);
+    for (std::int64_t i = 0; i < view.rows(); ++i)
+      if (problem.landmark_free[static_cast<std::size_t>(view.data[i])] == 0)
+        refuse("rows: entry " + std::to_string(i) + " is landmark " + std::to_string(view.data[i]) +
+               ", which is frozen");
+    return view;
+  }
+
   void expect_linearized() const {
     if (!system_->linearized()) refuse("call linearize first");
   }
@@ -201,12 +244,23 @@ void bind_landmark_system(nb::module_& module) {
            nb::arg("log_scale"), nb::arg("landmarks"),
            "Return core, border, corner, gradient, largest landmark gradient, and whether all is finite.")
       .def("landmark_blocks", &BoundLandmarkSystem::landmark_blocks,
-           "Return the landmarks' Hessian blocks (N, 3, 3) and gradients (N, 3) of the last linearisation.")
-      .def("reduce", &BoundLandmarkSystem::reduce, nb::arg("damping"), nb::arg("min_diagonal"),
-           nb::arg("max_diagonal"), nb::arg("core"), nb::arg("border"), nb::arg("corner"), nb::arg("gradient"),
+           "Return the landmarks' Hessian blocks (N, 3, 3) and gradients (N, 3) of the last linearization.")
+      .def("add_to_landmarks", &BoundLandmarkSystem::add_to_landmarks, nb::arg("rows"), nb::arg("blocks"),
+           nb::arg("gradients"),
+           "Add what other factors give to free landmarks rows (n,): V += blocks (n, 3, 3) and g += gradients (n, 3), "
+           "whitened and with their kernels, after linearize and before reduce. Return the largest landmark gradient.")
+      .def("reduce", &BoundLandmarkSystem::reduce, nb::arg("damping"), nb::arg("min_diagonal"), nb::arg("max_diagonal"),
+           nb::arg("core"), nb::arg("border"), nb::arg("corner"), nb::arg("gradient"),
            "Return the reduced core, border, corner and right-hand side, or None if a landmark is not determined.")
+      .def("whitened_coupling", &BoundLandmarkSystem::whitened_coupling, nb::arg("rows"),
+           "Return L^-1 E^T and L^-1 g, (n, 3, columns + 5), of free landmarks rows (n,), V + damping D = L L^T: core "
+           "columns, four intrinsics (frozen ones included), gradient.")
+      .def("inverse_factors", &BoundLandmarkSystem::inverse_factors, nb::arg("rows"),
+           "Return L^-1 (n, 3, 3) of free landmarks rows (n,), V + damping D = L L^T.")
       .def("back_substitute", &BoundLandmarkSystem::back_substitute, nb::arg("camera_step"),
-           "Return the landmarks' step (N, 3) and its sums slope, damped and squared.")
+           nb::arg("extra") = nb::none(),
+           "Return the landmarks' step (N, 3) and its sums slope, damped and squared; extra (N, 3) is added to "
+           "E^T camera_step + g, and is not read for frozen landmarks.")
       .def_prop_ro("num_pairs", &BoundLandmarkSystem::num_pairs, "Observations of free landmarks.");
 }
 

@@ -9,8 +9,8 @@ namespace uni4d_fg {
 namespace {
 
 /// Check the columns of free entries: each of [0, size) at most once, -1 for frozen ones.
-std::vector<std::int64_t> expect_columns(const AnyArray& array, const char* name, std::initializer_list<std::int64_t> shape,
-                                         int size) {
+std::vector<std::int64_t> expect_columns(const AnyArray& array, const char* name,
+                                         std::initializer_list<std::int64_t> shape, int size) {
   const View<std::int64_t> view = expect_integers(array, name, shape);
   std::vector<std::int64_t> columns(view.data, view.data + view.size());
   for (const std::int64_t column : columns)
@@ -34,10 +34,12 @@ void bind_pair_system(nb::module_& module) {
       .def(
           "__init__",
           [](PairSystem* self, const AnyArray& source, const AnyArray& target, const AnyArray& uv_source,
-             const AnyArray& depth, const AnyArray& uv_target, const AnyArray& sigma, const AnyArray& weight, int kernel,
-             double threshold, const AnyArray& pose_columns, const AnyArray& intrinsics_columns, int size, int threads) {
+             const AnyArray& depth, const AnyArray& uv_target, const AnyArray& sigma, const AnyArray& weight,
+             int kernel, double threshold, const AnyArray& pose_columns, const AnyArray& intrinsics_columns, int size,
+             int threads) {
             if (size < 0 || size > kMostColumns)
-              refuse("size: expected a number in [0, " + std::to_string(kMostColumns) + "], got " + std::to_string(size));
+              refuse("size: expected a number in [0, " + std::to_string(kMostColumns) + "], got " +
+                     std::to_string(size));
             const std::int64_t poses = expect_integers(pose_columns, "pose_columns", {kAnyLength, 6}).rows();
             const View<std::int64_t> sources = expect_rows(source, "source", kAnyLength, poses);
             PairRows rows;
@@ -53,7 +55,8 @@ void bind_pair_system(nb::module_& module) {
             rows.weight = expect_weights(weight, "weight", rows.count).data;
             const Kernel checked_kernel = expect_kernel(kernel, threshold);
             std::vector<std::int64_t> pose_at = expect_columns(pose_columns, "pose_columns", {poses, 6}, size);
-            std::vector<std::int64_t> intrinsics_at = expect_columns(intrinsics_columns, "intrinsics_columns", {4}, size);
+            std::vector<std::int64_t> intrinsics_at =
+                expect_columns(intrinsics_columns, "intrinsics_columns", {4}, size);
             const int workers = expect_threads(threads);
             nb::gil_scoped_release release;
             new (self) PairSystem(expect_count(poses, "pose_columns"), rows, checked_kernel, std::move(pose_at),

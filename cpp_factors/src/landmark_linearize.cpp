@@ -14,7 +14,8 @@ struct ChunkPoints {
   double xyz[3 * kChunkLandmarks];
   ChunkPoints(const LandmarkChunk& chunk, const double* landmarks) {
     for (std::size_t i = 0; i < chunk.landmarks.size(); ++i)
-      for (std::size_t k = 0; k < 3; ++k) xyz[3 * i + k] = landmarks[3 * static_cast<std::size_t>(chunk.landmarks[i]) + k];
+      for (std::size_t k = 0; k < 3; ++k)
+        xyz[3 * i + k] = landmarks[3 * static_cast<std::size_t>(chunk.landmarks[i]) + k];
   }
 };
 
@@ -40,75 +41,75 @@ UNI4D_FG_INLINE void energies(const PassInput& in, const LandmarkChunk& chunk, d
   const GroupArrays groups(chunk);
   for (std::size_t i = 0; i < groups.count; ++i) {
     const RecordGroup& group = groups.groups[i];
-    const double* data = groups.data + i * kFields * kPackLanes;
-    const PackPoint p = gather_points(points.xyz, groups.lane_landmark + i * kPackLanes);
-    const PackPoint x = pack_to_camera(in.state.world_T_cam + 16 * group.frame, p);
-    const PackDepth z = pack_depth(x.z);
-    const Pack g = pack_inverse_depth(z);
-    const Pack u = (field(data, kU) - (k.fx * x.x * g + k.cx)) * field(data, kInverseSigmaU);
-    const Pack v = (field(data, kV) - (k.fy * x.y * g + k.cy)) * field(data, kInverseSigmaV);
-    const Pack rho = pack_rho(in.reprojection_kernels[group.reprojection], u * u + v * v);
-    Pack total = load_pack(reprojection + group.reprojection * kPackLanes);
-    total += field(data, kWeight) * rho;
-    store_pack(total, reprojection + group.reprojection * kPackLanes);
+    const double* data = groups.data + i * kFields * kSimd8Width;
+    const SimdPoint p = gather_points(points.xyz, groups.lane_landmark + i * kSimd8Width);
+    const SimdPoint x = to_camera(in.state.world_T_cam + 16 * group.frame, p);
+    const SimdDepth z = guarded_depth(x.z);
+    const Simd8 g = inverse_depth(z);
+    const Simd8 u = (field(data, kU) - (k.fx * x.x * g + k.cx)) * field(data, kInverseSigmaU);
+    const Simd8 v = (field(data, kV) - (k.fy * x.y * g + k.cy)) * field(data, kInverseSigmaV);
+    const Simd8 robust = rho(in.reprojection_kernels[group.reprojection], u * u + v * v);
+    Simd8 total = load_simd8(reprojection + group.reprojection * kSimd8Width);
+    total += field(data, kWeight) * robust;
+    store_simd8(total, reprojection + group.reprojection * kSimd8Width);
     if constexpr (kDepth) {
-      const Pack r = (pack_log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) *
-                     field(data, kInverseSigmaDepth);
-      total = load_pack(depth + group.depth * kPackLanes);
-      total += field(data, kDepthWeight) * pack_rho(in.depth_kernels[group.depth], r * r);
-      store_pack(total, depth + group.depth * kPackLanes);
+      const Simd8 r =
+          (log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) * field(data, kInverseSigmaDepth);
+      total = load_simd8(depth + group.depth * kSimd8Width);
+      total += field(data, kDepthWeight) * rho(in.depth_kernels[group.depth], r * r);
+      store_simd8(total, depth + group.depth * kSimd8Width);
     }
   }
 }
 
 /// base + a * b, or base alone where no batch has a third row.
 template <bool kDepth>
-UNI4D_FG_INLINE Pack plus(const Pack& base, const Pack& a, const Pack& b) {
+UNI4D_FG_INLINE Simd8 plus(const Simd8& base, const Simd8& a, const Simd8& b) {
   if constexpr (kDepth) return base + a * b;
   (void)a, (void)b;
   return base;
 }
 
-UNI4D_FG_INLINE void add(double* sums, int place, const Pack& value) {
-  double* at = sums + place * kPackLanes;
-  store_pack(load_pack(at) + value, at);
+UNI4D_FG_INLINE void add(double* sums, int place, const Simd8& value) {
+  double* at = sums + place * kSimd8Width;
+  store_simd8(load_simd8(at) + value, at);
 }
 
 constexpr std::size_t kGroupsAhead = 2;
 
-/// Where eight records put what they computed.
-struct Lanes {
+/// Where eight records, one per lane, put what they computed.
+struct GroupTargets {
   const RecordGroup& group;
   const std::uint8_t* landmark;
   const int* pair;
 };
 
 /// Hand row `row` (8 columns, a lane per record) of the coupling blocks to their pairs.
-UNI4D_FG_INLINE void store_coupling(const Lanes& lanes, const Pack* columns, int row, double* coupling) {
-  Pack records[kPackLanes];
+UNI4D_FG_INLINE void store_coupling(const GroupTargets& targets, const Simd8* columns, int row, double* coupling) {
+  Simd8 records[kSimd8Width];
   transpose(columns, records);
-  for (int lane = 0; lane < kPackLanes; ++lane) {
-    if (lane >= lanes.group.used) break;
-    double* at = coupling + static_cast<std::size_t>(lanes.pair[lane]) * kWidth + row * kPackLanes;
-    store_pack(lanes.group.first ? records[lane] : load_pack(at) + records[lane], at);
+  for (int lane = 0; lane < kSimd8Width; ++lane) {
+    if (lane >= targets.group.used) break;
+    double* at = coupling + static_cast<std::size_t>(targets.pair[lane]) * kWidth + row * kSimd8Width;
+    store_simd8(targets.group.first ? records[lane] : load_simd8(at) + records[lane], at);
   }
 }
 
 /// Ask for the coupling blocks of records to come: they lie apart, where the processor does not foresee them.
 UNI4D_FG_INLINE void prefetch_coupling(const int* pair, const double* coupling) {
-  for (int lane = 0; lane < kPackLanes; ++lane)
+  for (int lane = 0; lane < kSimd8Width; ++lane)
     for (int row = 0; row < 3; ++row)
-      prefetch_for_writing(coupling + static_cast<std::size_t>(pair[lane]) * kWidth + row * kPackLanes);
+      prefetch_for_writing(coupling + static_cast<std::size_t>(pair[lane]) * kWidth + row * kSimd8Width);
 }
 
 /// Add eight sums at place `row` of the records' landmarks.
-UNI4D_FG_INLINE void add_to_landmarks(const Lanes& lanes, const Pack* columns, int row, double* by_landmark) {
-  Pack records[kPackLanes];
+UNI4D_FG_INLINE void add_to_landmarks(const GroupTargets& targets, const Simd8* columns, int row, double* by_landmark) {
+  Simd8 records[kSimd8Width];
   transpose(columns, records);
-  for (int lane = 0; lane < kPackLanes; ++lane) {
-    if (lane >= lanes.group.used) break;
-    double* at = by_landmark + static_cast<std::size_t>(lanes.landmark[lane]) * kWidth + row * kPackLanes;
-    store_pack(load_pack(at) + records[lane], at);
+  for (int lane = 0; lane < kSimd8Width; ++lane) {
+    if (lane >= targets.group.used) break;
+    double* at = by_landmark + static_cast<std::size_t>(targets.landmark[lane]) * kWidth + row * kSimd8Width;
+    store_simd8(load_simd8(at) + records[lane], at);
   }
 }
 
@@ -123,34 +124,33 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
   for (std::size_t i = 0; i < groups.count; ++i) {
     const RecordGroup& group = groups.groups[i];
     if (i + kGroupsAhead < groups.count && !chunk.frozen)
-      prefetch_coupling(groups.lane_pair + (i + kGroupsAhead) * kPackLanes, coupling);
-    const double* data = groups.data + i * kFields * kPackLanes;
-    const std::uint8_t* lane_landmark = groups.lane_landmark + i * kPackLanes;
+      prefetch_coupling(groups.lane_pair + (i + kGroupsAhead) * kSimd8Width, coupling);
+    const double* data = groups.data + i * kFields * kSimd8Width;
+    const std::uint8_t* lane_landmark = groups.lane_landmark + i * kSimd8Width;
     const double* m = in.state.world_T_cam + 16 * group.frame;
-    const PackPoint x = pack_to_camera(m, gather_points(points.xyz, lane_landmark));
-    const PackDepth z = pack_depth(x.z);
-    const Pack g = pack_inverse_depth(z);
-    const Pack xg = x.x * g, yg = x.y * g;
-    const Pack isu = field(data, kInverseSigmaU), isv = field(data, kInverseSigmaV);
-    Pack ru = (field(data, kU) - (k.fx * xg + k.cx)) * isu;
-    Pack rv = (field(data, kV) - (k.fy * yg + k.cy)) * isv;
-    const Pack scale =
-        square_root(field(data, kWeight) * pack_weight(in.reprojection_kernels[group.reprojection], ru * ru + rv * rv));
+    const SimdPoint x = to_camera(m, gather_points(points.xyz, lane_landmark));
+    const SimdDepth z = guarded_depth(x.z);
+    const Simd8 g = inverse_depth(z);
+    const Simd8 xg = x.x * g, yg = x.y * g;
+    const Simd8 isu = field(data, kInverseSigmaU), isv = field(data, kInverseSigmaV);
+    Simd8 ru = (field(data, kU) - (k.fx * xg + k.cx)) * isu;
+    Simd8 rv = (field(data, kV) - (k.fy * yg + k.cy)) * isv;
+    const Simd8 scale =
+        square_root(field(data, kWeight) * weight(in.reprojection_kernels[group.reprojection], ru * ru + rv * rv));
     ru = ru * scale;
     rv = rv * scale;
     // r = z - pi: the rows of -d pi / d x are (a, 0, b) and (0, c, d).
-    const Pack ku = isu * scale, kv = isv * scale;
-    const Pack slope = z.inverse * z.inverse;
-    const Pack a = -(k.fx * g * ku), b = k.fx * x.x * slope * ku;
-    const Pack c = -(k.fy * g * kv), d = k.fy * x.y * slope * kv;
-    const Pack ju[5] = {-(b * x.y), b * x.x - a * x.z, a * x.y, -a, -b};
-    const Pack jv[5] = {c * x.z - d * x.y, d * x.x, -(c * x.x), -c, -d};
-    Pack rd{}, js{}, e{}, jd[3] = {Pack{}, Pack{}, Pack{}};
+    const Simd8 ku = isu * scale, kv = isv * scale;
+    const Simd8 slope = z.inverse * z.inverse;
+    const Simd8 a = -(k.fx * g * ku), b = k.fx * x.x * slope * ku;
+    const Simd8 c = -(k.fy * g * kv), d = k.fy * x.y * slope * kv;
+    const Simd8 ju[5] = {-(b * x.y), b * x.x - a * x.z, a * x.y, -a, -b};
+    const Simd8 jv[5] = {c * x.z - d * x.y, d * x.x, -(c * x.x), -c, -d};
+    Simd8 rd{}, js{}, e{}, jd[3] = {Simd8{}, Simd8{}, Simd8{}};
     if constexpr (kDepth) {
-      const Pack isd = field(data, kInverseSigmaDepth);
-      rd = (pack_log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) * isd;
-      const Pack scale_depth =
-          square_root(field(data, kDepthWeight) * pack_weight(in.depth_kernels[group.depth], rd * rd));
+      const Simd8 isd = field(data, kInverseSigmaDepth);
+      rd = (log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) * isd;
+      const Simd8 scale_depth = square_root(field(data, kDepthWeight) * weight(in.depth_kernels[group.depth], rd * rd));
       rd = rd * scale_depth;
       js = -(isd * scale_depth);
       e = -(z.inverse * js);
@@ -159,7 +159,7 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
       jd[2] = -e;
     }
 
-    double* sums = frame_sums + static_cast<std::size_t>(group.frame) * kSums * kPackLanes;
+    double* sums = frame_sums + static_cast<std::size_t>(group.frame) * kSums * kSimd8Width;
     // Pose with pose and gradient: rows u, v, depth have entries where kPoseOfU, kPoseOfV, kPoseOfDepth say.
     add(sums, kPose + 0, plus<kDepth>(ju[0] * ju[0] + jv[0] * jv[0], jd[0], jd[0]));
     add(sums, kPose + 1, plus<kDepth>(ju[1] * ju[0] + jv[1] * jv[0], jd[1], jd[0]));
@@ -192,7 +192,7 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
       add(sums, kScale, js * js);
       add(sums, kScale + 1, js * rd);
     }
-    const Pack jfx = -(xg * ku), jcx = -ku, jfy = -(yg * kv), jcy = -kv;
+    const Simd8 jfx = -(xg * ku), jcx = -ku, jfy = -(yg * kv), jcy = -kv;
     if constexpr (kIntrinsics) {
       for (int j = 0; j < 5; ++j) {
         add(sums, kPoseU + 2 * j, ju[j] * jfx);
@@ -213,32 +213,32 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
     }
     if (chunk.frozen) continue;
 
-    Pack lu[3], lv[3], ld[3];
+    Simd8 lu[3], lv[3], ld[3];
     for (int j = 0; j < 3; ++j) {
       lu[j] = a * m[4 * j] + b * m[4 * j + 2];
       lv[j] = c * m[4 * j + 1] + d * m[4 * j + 2];
       ld[j] = e * m[4 * j + 2];
     }
-    const Lanes lanes{group, lane_landmark, groups.lane_pair + i * kPackLanes};
+    const GroupTargets targets{group, lane_landmark, groups.lane_pair + i * kSimd8Width};
     for (int j = 0; j < 3; ++j) {
-      Pack columns[kPackLanes] = {plus<kDepth>(lu[j] * ju[0] + lv[j] * jv[0], ld[j], jd[0]),
-                                  plus<kDepth>(lu[j] * ju[1] + lv[j] * jv[1], ld[j], jd[1]),
-                                  lu[j] * ju[2] + lv[j] * jv[2],
-                                  lu[j] * ju[3],
-                                  lv[j] * jv[3],
-                                  plus<kDepth>(lu[j] * ju[4] + lv[j] * jv[4], ld[j], jd[2]),
-                                  Pack{},
-                                  Pack{}};
+      Simd8 columns[kSimd8Width] = {plus<kDepth>(lu[j] * ju[0] + lv[j] * jv[0], ld[j], jd[0]),
+                                    plus<kDepth>(lu[j] * ju[1] + lv[j] * jv[1], ld[j], jd[1]),
+                                    lu[j] * ju[2] + lv[j] * jv[2],
+                                    lu[j] * ju[3],
+                                    lv[j] * jv[3],
+                                    plus<kDepth>(lu[j] * ju[4] + lv[j] * jv[4], ld[j], jd[2]),
+                                    Simd8{},
+                                    Simd8{}};
       if constexpr (kDepth) columns[6] = ld[j] * js;
-      store_coupling(lanes, columns, j, coupling);
+      store_coupling(targets, columns, j, coupling);
     }
     // V, the gradient, and the coupling to the intrinsics: 24 sums in the order of LandmarkSystem::landmarks_.
-    Pack point[kWidth];
+    Simd8 point[kWidth];
     int place = 0;
     for (int j = 0; j < 3; ++j)
       for (int n = j; n < 3; ++n) point[place++] = plus<kDepth>(lu[j] * lu[n] + lv[j] * lv[n], ld[j], ld[n]);
     for (int j = 0; j < 3; ++j) point[6 + j] = plus<kDepth>(lu[j] * ru + lv[j] * rv, ld[j], rd);
-    for (int j = 9; j < kWidth; ++j) point[j] = Pack{};
+    for (int j = 9; j < kWidth; ++j) point[j] = Simd8{};
     if constexpr (kIntrinsics) {
       for (int j = 0; j < 3; ++j) {
         point[9 + 4 * j] = lu[j] * jfx;
@@ -248,7 +248,7 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
       }
     }
     for (int row = 0; row < (kIntrinsics ? 3 : 2); ++row)
-      add_to_landmarks(lanes, point + row * kPackLanes, row, by_landmark);
+      add_to_landmarks(targets, point + row * kSimd8Width, row, by_landmark);
   }
   if (chunk.frozen) return;
   for (std::size_t i = 0; i < chunk.landmarks.size(); ++i)
@@ -266,10 +266,10 @@ UNI4D_FG_WIDE_CLONES void energies_depth(const PassInput& in, const LandmarkChun
   energies<true>(in, chunk, reprojection, depth);
 }
 
-#define UNI4D_FG_LINEARIZE(name, depth, intrinsics)                                                             \
+#define UNI4D_FG_LINEARIZE(name, depth, intrinsics)                                                               \
   UNI4D_FG_WIDE_CLONES void name(const PassInput& in, const LandmarkChunk& chunk, double* sums, double* coupling, \
-                                 double* landmarks) {                                                           \
-    linearize<depth, intrinsics>(in, chunk, sums, coupling, landmarks);                                         \
+                                 double* landmarks) {                                                             \
+    linearize<depth, intrinsics>(in, chunk, sums, coupling, landmarks);                                           \
   }
 UNI4D_FG_LINEARIZE(linearize_plain, false, false)
 UNI4D_FG_LINEARIZE(linearize_depth, true, false)

@@ -31,12 +31,12 @@ void whiten_pairs(const LandmarkChunk& chunk, const double* coupling, const doub
 
 /// Add the tile products of a chunk.
 struct TileInput {
-  const double* whitened;  ///< (pairs, 3, 8)
-  const double* border;    ///< (64, 3, 8): whitened intrinsics rows 0..3 and gradient 4 of each landmark
-  const int* place;        ///< (frames, 64) pair of a frame and landmark
+  const double* whitened;          ///< (pairs, 3, 8)
+  const double* border;            ///< (64, 3, 8): whitened intrinsics rows 0..3 and gradient 4 of each landmark
+  const int* place;                ///< (frames, 64) pair of a frame and landmark
   const std::int64_t* tile_begin;  ///< per frame of the sequence
-  double* tiles;           ///< tile (i, j) at tile_begin[i] + j - i
-  double* border_tiles;    ///< (T, 7, 8), and one more for the border with itself
+  double* tiles;                   ///< tile (i, j) at tile_begin[i] + j - i
+  double* border_tiles;            ///< (T, 7, 8), and one more for the border with itself
   double* corner_tile;
 };
 void multiply_tiles(const LandmarkChunk& chunk, const TileInput& in);

@@ -12,7 +12,8 @@ namespace {
 
 constexpr int kRecordsPerWorker = 2000;
 
-/// One factor: its frame and landmark within the chunk above, its number over all batches below.
+/// One factor, as a number by which factors of a chunk are sorted: by frame, then landmark, then order of being given.
+///     (frame * 64 + place of the landmark in its chunk) << 32 | number of the factor over all batches
 using Entry = std::uint64_t;
 constexpr int kNumberBits = 32;
 
@@ -67,7 +68,8 @@ std::vector<int> order_landmarks(const LandmarkProblem& problem) {
   std::iota(order.begin(), order.end(), 0);
   std::sort(order.begin(), order.end(), [&](int left, int right) {
     const auto a = static_cast<std::size_t>(left), b = static_cast<std::size_t>(right);
-    if (problem.landmark_free[a] != problem.landmark_free[b]) return problem.landmark_free[a] > problem.landmark_free[b];
+    if (problem.landmark_free[a] != problem.landmark_free[b])
+      return problem.landmark_free[a] > problem.landmark_free[b];
     if (first[a] != first[b]) return first[a] < first[b];
     if (last[a] != last[b]) return last[a] < last[b];
     return left < right;
@@ -100,6 +102,8 @@ void set_depth(const Factor& factor, Record& record) {
   record.depth_weight = batch.weight[factor.row];
 }
 
+/// Cut the records of one frame into groups of eight and write them, one lane per record. All records of a group have
+/// the same layer (see fill_chunk) and batches; lanes left over refer to the head's landmark with weight 0.
 void append_groups(std::vector<Record>& records, int frame, LandmarkChunk& chunk) {
   auto same = [](const Record& a, const Record& b) {
     return a.layer == b.layer && a.reprojection == b.reprojection && a.depth == b.depth;
@@ -116,29 +120,29 @@ void append_groups(std::vector<Record>& records, int frame, LandmarkChunk& chunk
   std::size_t begin = 0;
   while (begin < records.size()) {
     std::size_t end = begin;
-    while (end < records.size() && end < begin + kPackLanes && same(records[begin], records[end])) ++end;
+    while (end < records.size() && end < begin + kSimd8Width && same(records[begin], records[end])) ++end;
     const Record& head = records[begin];
     chunk.groups.push_back({frame, head.reprojection, head.depth, static_cast<int>(end - begin), head.layer == 0});
     const std::size_t at = chunk.data.size();
-    chunk.data.resize(at + kFields * kPackLanes, 0.0);
+    chunk.data.resize(at + kFields * kSimd8Width, 0.0);
     double* data = chunk.data.data() + at;
-    for (std::size_t lane = 0; lane < kPackLanes; ++lane) {
+    for (std::size_t lane = 0; lane < kSimd8Width; ++lane) {
       const bool used = begin + lane < end;
       const Record& record = used ? records[begin + lane] : head;
       chunk.lane_landmark.push_back(record.landmark);
       chunk.lane_pair.push_back(record.pair);
       if (!used) continue;
       if (record.uv != nullptr) {
-        data[kU * kPackLanes + lane] = record.uv[0];
-        data[kV * kPackLanes + lane] = record.uv[1];
-        data[kInverseSigmaU * kPackLanes + lane] = record.inverse_sigma_u;
-        data[kInverseSigmaV * kPackLanes + lane] = record.inverse_sigma_v;
-        data[kWeight * kPackLanes + lane] = record.weight;
+        data[kU * kSimd8Width + lane] = record.uv[0];
+        data[kV * kSimd8Width + lane] = record.uv[1];
+        data[kInverseSigmaU * kSimd8Width + lane] = record.inverse_sigma_u;
+        data[kInverseSigmaV * kSimd8Width + lane] = record.inverse_sigma_v;
+        data[kWeight * kSimd8Width + lane] = record.weight;
       }
       if (record.inverse_sigma_depth > 0.0) {
-        data[kLogDepth * kPackLanes + lane] = std::log(record.depth_cue);
-        data[kInverseSigmaDepth * kPackLanes + lane] = record.inverse_sigma_depth;
-        data[kDepthWeight * kPackLanes + lane] = record.depth_weight;
+        data[kLogDepth * kSimd8Width + lane] = std::log(record.depth_cue);
+        data[kInverseSigmaDepth * kSimd8Width + lane] = record.inverse_sigma_depth;
+        data[kDepthWeight * kSimd8Width + lane] = record.depth_weight;
       }
     }
     begin = end;
@@ -147,6 +151,9 @@ void append_groups(std::vector<Record>& records, int frame, LandmarkChunk& chunk
 }
 
 /// Turn a chunk's factors, sorted by frame and landmark, into pairs and groups.
+///
+/// The n-th reprojection and the n-th depth factor of a pair share a record, of layer n. Layer 0 writes a pair's
+/// coupling block and later layers add to it; they are in groups of their own, after layer 0.
 void fill_chunk(const FactorNumbers& numbers, std::vector<Entry>::const_iterator entry,
                 std::vector<Entry>::const_iterator end, LandmarkChunk& chunk) {
   std::vector<Record> records;
@@ -154,7 +161,7 @@ void fill_chunk(const FactorNumbers& numbers, std::vector<Entry>::const_iterator
   int frame = -1;
   const auto factors = static_cast<std::size_t>(end - entry);
   chunk.pair_landmark.reserve(factors);
-  chunk.data.reserve((factors / kPackLanes + 1) * kFields * kPackLanes);
+  chunk.data.reserve((factors / kSimd8Width + 1) * kFields * kSimd8Width);
   while (entry != end) {
     const Entry place = *entry >> kNumberBits;
     const auto landmark = static_cast<std::uint8_t>(place % kChunkLandmarks);
@@ -191,6 +198,7 @@ void fill_chunk(const FactorNumbers& numbers, std::vector<Entry>::const_iterator
     for (const int n : seen_by) chunk.cost += 0.5 * n * (n + 1) + 2.0 * n + 4.0;
 }
 
+/// Cut the chunks into ranges of about equal cost, one per worker: (workers + 1) first chunks.
 std::vector<int> balance(const std::vector<LandmarkChunk>& chunks, int threads) {
   double total = 0.0;
   std::size_t groups = 0;
@@ -198,7 +206,7 @@ std::vector<int> balance(const std::vector<LandmarkChunk>& chunks, int threads) 
     total += chunk.cost;
     groups += chunk.groups.size();
   }
-  const int most = static_cast<int>(std::min<std::size_t>(groups * kPackLanes, std::numeric_limits<int>::max()));
+  const int most = static_cast<int>(std::min<std::size_t>(groups * kSimd8Width, std::numeric_limits<int>::max()));
   const int workers =
       std::max(1, std::min(useful_threads(threads, most, kRecordsPerWorker), static_cast<int>(chunks.size())));
   std::vector<int> begin{0};

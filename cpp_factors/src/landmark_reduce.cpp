@@ -17,7 +17,7 @@ UNI4D_FG_INLINE int lowest_bit(std::uint64_t mask) {
 #endif
 }
 
-/// tile (7, 8) += sum over landmarks of A^T B with A, B (3, 8); row 7 of the product is not used.
+/// The two factors of a product: whitened blocks (3, 8), and which of them belongs to landmark 0..63 of the chunk.
 struct Places {
   const double* rows;
   const int* row_place;
@@ -25,8 +25,9 @@ struct Places {
   const int* column_place;  ///< null: the landmark itself
 };
 
+/// tile (7, 8) += sum over the landmarks `shared` of A^T B with A, B (3, 8); row 7 of the product is not used.
 UNI4D_FG_INLINE void multiply(std::uint64_t shared, const Places& at, double* tile) {
-  Pack sums[kFrameColumns] = {};
+  Simd8 sums[kFrameColumns] = {};
   while (shared != 0) {
     const int landmark = lowest_bit(shared);
     shared &= shared - 1;
@@ -34,15 +35,15 @@ UNI4D_FG_INLINE void multiply(std::uint64_t shared, const Places& at, double* ti
     const int column = at.column_place != nullptr ? at.column_place[landmark] : landmark;
     const double* b = at.columns + static_cast<std::size_t>(column) * kWidth;
     for (int k = 0; k < 3; ++k) {
-      const Pack right = load_pack(b + k * kPackLanes);
-      for (int row = 0; row < kFrameColumns; ++row) sums[row] += a[k * kPackLanes + row] * right;
+      const Simd8 right = load_simd8(b + k * kSimd8Width);
+      for (int row = 0; row < kFrameColumns; ++row) sums[row] += a[k * kSimd8Width + row] * right;
     }
   }
   for (int row = 0; row < kFrameColumns; ++row)
-    store_pack(load_pack(tile + row * kPackLanes) + sums[row], tile + row * kPackLanes);
+    store_simd8(load_simd8(tile + row * kSimd8Width) + sums[row], tile + row * kSimd8Width);
 }
 
-constexpr std::size_t kTile = kFrameColumns * kPackLanes;
+constexpr std::size_t kTile = kFrameColumns * kSimd8Width;
 
 }  // namespace
 
@@ -50,16 +51,17 @@ UNI4D_FG_WIDE_CLONES void whiten_pairs(const LandmarkChunk& chunk, const double*
                                        double* whitened) {
   const std::uint8_t* landmark = chunk.pair_landmark.data();
   const auto pairs = static_cast<std::size_t>(chunk.num_pairs());
+  // Forward substitution on three rows of eight columns at once: a row is one Simd8.
   for (std::size_t i = 0; i < pairs; ++i) {
     const double* in = coupling + i * kWidth;
     const double* f = factors + 6 * landmark[i];
     double* out = whitened + i * kWidth;
-    const Pack first = load_pack(in) * f[0];
-    const Pack second = (load_pack(in + kPackLanes) - f[1] * first) * f[2];
-    const Pack third = (load_pack(in + 2 * kPackLanes) - f[3] * first - f[4] * second) * f[5];
-    store_pack(first, out);
-    store_pack(second, out + kPackLanes);
-    store_pack(third, out + 2 * kPackLanes);
+    const Simd8 first = load_simd8(in) * f[0];
+    const Simd8 second = (load_simd8(in + kSimd8Width) - f[1] * first) * f[2];
+    const Simd8 third = (load_simd8(in + 2 * kSimd8Width) - f[3] * first - f[4] * second) * f[5];
+    store_simd8(first, out);
+    store_simd8(second, out + kSimd8Width);
+    store_simd8(third, out + 2 * kSimd8Width);
   }
 }
 
@@ -92,11 +94,11 @@ UNI4D_FG_WIDE_CLONES void apply_coupling(const LandmarkChunk& chunk, const doubl
   const int* begin = chunk.frame_begin.data();
   const std::size_t count = chunk.frames.size();
   for (std::size_t f = 0; f < count; ++f) {
-    const Pack step = load_pack(frame_step + static_cast<std::size_t>(frames[f]) * kPackLanes);
+    const Simd8 step = load_simd8(frame_step + static_cast<std::size_t>(frames[f]) * kSimd8Width);
     for (int i = begin[f]; i < begin[f + 1]; ++i) {
       const double* in = coupling + static_cast<std::size_t>(i) * kWidth;
       double* point = out + 3 * landmark[i];
-      for (int k = 0; k < 3; ++k) point[k] += sum(load_pack(in + k * kPackLanes) * step);
+      for (int k = 0; k < 3; ++k) point[k] += sum(load_simd8(in + k * kSimd8Width) * step);
     }
   }
 }

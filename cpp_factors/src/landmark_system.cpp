@@ -6,18 +6,23 @@
 #include <string>
 #include <utility>
 
+#include "landmark_cholesky.hpp"
 #include "landmark_frame_sums.hpp"
 #include "landmark_passes.hpp"
 #include "uni4d_fg/parallel.hpp"
 
 namespace uni4d_fg {
 
+using landmark_cholesky::clamp;
+using landmark_cholesky::factorize;
+using landmark_cholesky::solve_lower;
+using landmark_cholesky::solve_upper;
 using landmark_passes::kWidth;
 
 namespace {
 
-constexpr std::size_t kTile = kFrameColumns * kPackLanes;
-constexpr int kSumWidth = frame_sums::kSums * kPackLanes;
+constexpr std::size_t kTile = kFrameColumns * kSimd8Width;
+constexpr int kSumWidth = frame_sums::kSums * kSimd8Width;
 
 std::vector<Kernel> kernels_of(const std::vector<LandmarkBatch>& batches) {
   std::vector<Kernel> kernels;
@@ -27,49 +32,11 @@ std::vector<Kernel> kernels_of(const std::vector<LandmarkBatch>& batches) {
   return kernels;
 }
 
-double clamp(double diagonal, const DampingBounds& bounds) {
-  return std::min(std::max(diagonal, bounds.min_diagonal), bounds.max_diagonal);
-}
-
-/// Cholesky factor of V + damping, as stored in factors_; false unless positive definite.
-bool factorize(const double* v, const DampingBounds& bounds, double* out) {
-  const double d = bounds.damping;
-  const double xx = v[0] + d * clamp(v[0], bounds), yy = v[3] + d * clamp(v[3], bounds),
-               zz = v[5] + d * clamp(v[5], bounds);
-  if (!(xx > 0.0)) return false;
-  const double l00 = std::sqrt(xx), l10 = v[1] / l00, l20 = v[2] / l00;
-  const double second = yy - l10 * l10;
-  if (!(second > 0.0)) return false;
-  const double l11 = std::sqrt(second), l21 = (v[4] - l20 * l10) / l11;
-  const double third = zz - l20 * l20 - l21 * l21;
-  if (!(third > 0.0)) return false;
-  out[0] = 1.0 / l00;
-  out[1] = l10;
-  out[2] = 1.0 / l11;
-  out[3] = l20;
-  out[4] = l21;
-  out[5] = 1.0 / std::sqrt(third);
-  return true;
-}
-
-/// x <- L^{-1} x.
-void solve_lower(const double* f, double* x) {
-  x[0] *= f[0];
-  x[1] = (x[1] - f[1] * x[0]) * f[2];
-  x[2] = (x[2] - f[3] * x[0] - f[4] * x[1]) * f[5];
-}
-
-/// x <- L^{-T} x.
-void solve_upper(const double* f, double* x) {
-  x[2] *= f[5];
-  x[1] = (x[1] - f[4] * x[2]) * f[2];
-  x[0] = (x[0] - f[1] * x[1] - f[3] * x[2]) * f[0];
-}
-
 }  // namespace
 
 LandmarkSystem::LandmarkSystem(LandmarkProblem problem, int threads)
     : problem_(std::move(problem)),
+      threads_(threads),
       reprojection_kernels_(kernels_of(problem_.reprojection)),
       depth_kernels_(kernels_of(problem_.depth)),
       num_reprojection_(static_cast<int>(problem_.reprojection.size())),
@@ -88,6 +55,9 @@ LandmarkSystem::LandmarkSystem(LandmarkProblem problem, int threads)
   tiles_.resize(count);
   scratch_.resize(count);
   scratch_place_.resize(count);
+  // Each worker sums the tiles of E V^{-1} E^T of its chunks: tile (i, j) of frames i <= j is needed if a landmark of
+  // these chunks is seen in both. Row i has tiles for j = i .. last_frame_[i], the first at tile_begin_[i]; behind all
+  // rows come one tile per frame for its border (intrinsics and gradient) and one for the border with itself.
   for (std::size_t w = 0; w < count; ++w) {
     frame_sums_[w].resize(frames * kSumWidth);
     last_frame_[w].assign(frames, -1);
@@ -125,8 +95,8 @@ void LandmarkSystem::check_storage(const std::vector<int>& last_frame) const {
     const int span = *std::max_element(begin, end) - *lowest + 1;
     if (span > problem_.stored_rows)
       throw std::invalid_argument("stored_rows: " + std::to_string(problem_.stored_rows) + " are too few; frames " +
-                                  std::to_string(frame) + " and " + std::to_string(last) + " share a landmark and span " +
-                                  std::to_string(span) + " columns");
+                                  std::to_string(frame) + " and " + std::to_string(last) +
+                                  " share a landmark and span " + std::to_string(span) + " columns");
   }
 }
 
@@ -134,24 +104,24 @@ void LandmarkSystem::energies(const LandmarkState& state, double* out) const {
   const auto count = static_cast<std::size_t>(workers());
   const landmark_passes::PassInput in{state, reprojection_kernels_.data(), depth_kernels_.data()};
   const std::size_t reprojections = reprojection_kernels_.size(), depths = depth_kernels_.size();
-  std::vector<AlignedDoubles> sums(count, AlignedDoubles((reprojections + depths) * kPackLanes, 0.0));
+  std::vector<AlignedDoubles> sums(count, AlignedDoubles((reprojections + depths) * kSimd8Width, 0.0));
   parallel_for(workers(), workers(), [&](int worker, int, int) {
     const auto w = static_cast<std::size_t>(worker);
     double* own = sums[w].data();
     for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1]; ++i) {
       const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
       if (num_depth_ > 0)
-        landmark_passes::energies_depth(in, chunk, own, own + reprojections * kPackLanes);
+        landmark_passes::energies_depth(in, chunk, own, own + reprojections * kSimd8Width);
       else
         landmark_passes::energies_plain(in, chunk, own);
     }
   });
   for (int batch = 0; batch < num_batches(); ++batch) {
-    const std::size_t place =
-        batch < num_reprojection_ ? static_cast<std::size_t>(batch)
+    const std::size_t place = batch < num_reprojection_
+                                  ? static_cast<std::size_t>(batch)
                                   : reprojections + static_cast<std::size_t>(batch - num_reprojection_);
     out[batch] = 0.0;
-    for (const AlignedDoubles& own : sums) out[batch] += sum(load_pack(own.data() + place * kPackLanes));
+    for (const AlignedDoubles& own : sums) out[batch] += sum(load_simd8(own.data() + place * kSimd8Width));
   }
 }
 
@@ -159,10 +129,9 @@ LinearizeResult LandmarkSystem::linearize(const LandmarkState& state, const Came
   linearized_ = reduced_ = false;
   const landmark_passes::PassInput in{state, reprojection_kernels_.data(), depth_kernels_.data()};
   const landmark_passes::Linearize pass =
-      num_depth_ > 0 ? (problem_.intrinsics_free ? landmark_passes::linearize_depth_intrinsics
-                                                 : landmark_passes::linearize_depth)
-                     : (problem_.intrinsics_free ? landmark_passes::linearize_intrinsics
-                                                 : landmark_passes::linearize_plain);
+      num_depth_ > 0
+          ? (problem_.intrinsics_free ? landmark_passes::linearize_depth_intrinsics : landmark_passes::linearize_depth)
+          : (problem_.intrinsics_free ? landmark_passes::linearize_intrinsics : landmark_passes::linearize_plain);
   std::vector<LinearizeResult> results(static_cast<std::size_t>(workers()));
   parallel_for(workers(), workers(), [&](int worker, int, int) {
     const auto w = static_cast<std::size_t>(worker);
@@ -195,7 +164,8 @@ LinearizeResult LandmarkSystem::linearize(const LandmarkState& state, const Came
 }
 
 double* LandmarkSystem::core_column(const CameraSystem& system, int column) const {
-  // Such that entry (i, column) is at [i], whether dense or banded.
+  // Such that entry (i, column) is at [i]. A dense core has it at column * rows + i, a banded one at
+  // column * rows + (i - column): hence the start is `column` earlier there.
   const auto offset = static_cast<std::ptrdiff_t>(column) * problem_.stored_rows;
   return system.core + offset - (problem_.banded ? column : 0);
 }
@@ -216,7 +186,7 @@ void LandmarkSystem::write_camera_blocks(const CameraSystem& system) const {
     double total[kSums] = {};
     for (const AlignedDoubles& own : frame_sums_) {
       const double* sums = own.data() + static_cast<std::size_t>(frame) * kSumWidth;
-      for (int k = 0; k < kSums; ++k) total[k] += sum(load_pack(sums + k * kPackLanes));
+      for (int k = 0; k < kSums; ++k) total[k] += sum(load_simd8(sums + k * kSimd8Width));
     }
     for (int k = kIntrinsicsU; k < kSums; ++k) intrinsics[k - kIntrinsicsU] += total[k];
     double block[kFrameColumns][kFrameColumns] = {}, gradient[kFrameColumns], border[kFrameColumns][kBorder] = {};
@@ -279,9 +249,9 @@ bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBo
       double x[3];
       for (std::size_t j = 0; j < 3; ++j) x[j] = k < kBorder ? landmark[9 + kBorder * j + k] : landmark[6 + j];
       solve_lower(factor, x);
-      for (std::size_t j = 0; j < 3; ++j) border[i * kWidth + kPackLanes * j + k] = x[j];
+      for (std::size_t j = 0; j < 3; ++j) border[i * kWidth + kSimd8Width * j + k] = x[j];
     }
-    for (std::size_t j = 0; j < 3; ++j) std::fill_n(border + i * kWidth + kPackLanes * j + kBorder + 1, 3, 0.0);
+    for (std::size_t j = 0; j < 3; ++j) std::fill_n(border + i * kWidth + kSimd8Width * j + kBorder + 1, 3, 0.0);
   }
   if (chunk.frames.empty()) return true;
   landmark_passes::whiten_pairs(chunk, coupling_.data() + chunk.first_pair * kWidth, factors, whitened);
@@ -292,8 +262,8 @@ bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBo
   double* tiles = tiles_[w].data();
   const auto frames = static_cast<std::size_t>(problem_.num_frames);
   double* border_tiles = tiles + static_cast<std::size_t>(tile_begin_[w][frames]) * kTile;
-  landmark_passes::multiply_tiles(chunk, {whitened, border, place, tile_begin_[w].data(), tiles, border_tiles,
-                                          border_tiles + frames * kTile});
+  landmark_passes::multiply_tiles(
+      chunk, {whitened, border, place, tile_begin_[w].data(), tiles, border_tiles, border_tiles + frames * kTile});
   return true;
 }
 
@@ -339,20 +309,22 @@ void LandmarkSystem::write_reduced(const DampingBounds& bounds, const CameraSyst
       const int* columns = problem_.columns.data() + f * kFrameColumns;
       for (std::size_t w = 0; w < tiles_.size(); ++w) {
         const double* tile = tiles_[w].data() + static_cast<std::size_t>(tile_begin_[w][f]) * kTile;
+        // Tile (frame, other) has rows of `frame` and columns of `other` >= frame. The core stores its lower triangle
+        // by columns: entry (row of `other`, column of `frame`), and within the tile of a frame with itself j >= i.
         for (int other = frame; other <= last_frame_[w][f]; ++other, tile += kTile) {
           const int* rows = problem_.columns.data() + static_cast<std::size_t>(other) * kFrameColumns;
           for (int i = 0; i < kFrameColumns; ++i) {
             if (columns[i] < 0) continue;
             double* column = core_column(reduced, columns[i]);
             for (int j = other == frame ? i : 0; j < kFrameColumns; ++j)
-              if (rows[j] >= 0) column[rows[j]] -= tile[i * kPackLanes + j];
+              if (rows[j] >= 0) column[rows[j]] -= tile[i * kSimd8Width + j];
           }
         }
         const double* border = tiles_[w].data() + (static_cast<std::size_t>(tile_begin_[w][frames]) + f) * kTile;
         for (int i = 0; i < kFrameColumns; ++i) {
           if (columns[i] < 0) continue;
-          for (int k = 0; k < kBorder; ++k) reduced.border[columns[i] * kBorder + k] -= border[i * kPackLanes + k];
-          reduced.gradient[columns[i]] += border[i * kPackLanes + kBorder];
+          for (int k = 0; k < kBorder; ++k) reduced.border[columns[i] * kBorder + k] -= border[i * kSimd8Width + k];
+          reduced.gradient[columns[i]] += border[i * kSimd8Width + kBorder];
         }
       }
     }
@@ -360,18 +332,18 @@ void LandmarkSystem::write_reduced(const DampingBounds& bounds, const CameraSyst
   for (std::size_t w = 0; w < tiles_.size(); ++w) {
     const double* corner = tiles_[w].data() + (static_cast<std::size_t>(tile_begin_[w][frames]) + frames) * kTile;
     for (int i = 0; i < kBorder; ++i) {
-      for (int k = 0; k < kBorder; ++k) reduced.corner[i * kBorder + k] -= corner[i * kPackLanes + k];
-      reduced.gradient[size + i] += corner[i * kPackLanes + kBorder];
+      for (int k = 0; k < kBorder; ++k) reduced.corner[i * kBorder + k] -= corner[i * kSimd8Width + k];
+      reduced.gradient[size + i] += corner[i * kSimd8Width + kBorder];
     }
   }
 }
 
-StepSums LandmarkSystem::back_substitute(const double* camera_step, double* landmark_step) const {
-  AlignedDoubles frame_step(static_cast<std::size_t>(problem_.num_frames) * kPackLanes, 0.0);
+StepSums LandmarkSystem::back_substitute(const double* camera_step, const double* extra, double* landmark_step) const {
+  AlignedDoubles frame_step(static_cast<std::size_t>(problem_.num_frames) * kSimd8Width, 0.0);
   for (std::size_t f = 0; f < static_cast<std::size_t>(problem_.num_frames); ++f)
     for (std::size_t k = 0; k < kFrameColumns; ++k) {
       const int column = problem_.columns[f * kFrameColumns + k];
-      if (column >= 0) frame_step[f * kPackLanes + k] = camera_step[column];
+      if (column >= 0) frame_step[f * kSimd8Width + k] = camera_step[column];
     }
   const double* intrinsics_step = camera_step + problem_.num_columns;
   std::fill_n(landmark_step, 3 * static_cast<std::size_t>(problem_.num_landmarks), 0.0);
@@ -389,7 +361,7 @@ StepSums LandmarkSystem::back_substitute(const double* camera_step, double* land
         const double* landmark = landmarks_.data() + row * kWidth;
         double x[3];
         for (std::size_t j = 0; j < 3; ++j) {
-          x[j] = landmark[6 + j] + moved[3 * n + j];
+          x[j] = landmark[6 + j] + moved[3 * n + j] + (extra != nullptr ? extra[3 * row + j] : 0.0);
           for (std::size_t k = 0; k < kBorder; ++k) x[j] += landmark[9 + kBorder * j + k] * intrinsics_step[k];
         }
         solve_lower(factors_.data() + 6 * row, x);

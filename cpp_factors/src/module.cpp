@@ -3,7 +3,8 @@
 namespace nb = nanobind;
 
 namespace uni4d_fg {
-void bind_batches(nb::module_& module);
+void bind_factor_types(nb::module_& module);
+void bind_whitening(nb::module_& module);
 void bind_pair_system(nb::module_& module);
 void bind_landmark_system(nb::module_& module);
 void bind_trajectory_system(nb::module_& module);
@@ -14,8 +15,9 @@ NB_MODULE(_core, module) {
   // Objects that outlive the interpreter's own clean-up (in a failed test, say) are no reason to print.
   nb::set_leak_warnings(false);
   // Raised by every change of a signature or of a meaning.
-  module.attr("ABI") = 1;
-  uni4d_fg::bind_batches(module);
+  module.attr("ABI") = 2;
+  uni4d_fg::bind_factor_types(module);
+  uni4d_fg::bind_whitening(module);
   uni4d_fg::bind_pair_system(module);
   uni4d_fg::bind_landmark_system(module);
   uni4d_fg::bind_trajectory_system(module);

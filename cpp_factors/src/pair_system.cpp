@@ -5,8 +5,8 @@
 #include <utility>
 
 #include "uni4d_fg/camera.hpp"
-#include "uni4d_fg/lanes.hpp"
 #include "uni4d_fg/parallel.hpp"
+#include "uni4d_fg/simd.hpp"
 
 namespace uni4d_fg {
 
@@ -50,7 +50,8 @@ UNI4D_FG_INLINE double tile_energy(const Pose& relative, const Intrinsics& k, do
   return sum;
 }
 
-/// Columns of both residual rows of every factor, scaled: the u rows first, then the v rows.
+/// Columns of both residual rows of every factor, scaled: column j of factor n's u row is [j][n], of its v row
+/// [j][kTileRows + n].
 using Scratch = double[kColumns][2 * kTileRows];
 
 template <KernelKind kind>
@@ -99,20 +100,20 @@ UNI4D_FG_INLINE void tile_columns(const Pose& relative, const Intrinsics& k, dou
 }
 
 /// Add the products of one column with itself and the columns after it, summed over the rows of a tile. The sums stay
-/// in registers: hence the pack instead of a loop.
+/// in registers: hence the parameter pack instead of a loop.
 template <int column, int... after>
 UNI4D_FG_INLINE void add_products(const Scratch& a, int rows, double* sums, std::integer_sequence<int, after...>) {
-  Lanes total[sizeof...(after)] = {};
+  Simd4 total[sizeof...(after)] = {};
   for (int half = 0; half < 2; ++half)
-    for (int n = half * kTileRows; n < half * kTileRows + rows; n += kLanes) {
-      Lanes left, right;
-      load_lanes(&a[column][n], left);
-      ((load_lanes(&a[column + after][n], right), total[after] += left * right), ...);
+    for (int n = half * kTileRows; n < half * kTileRows + rows; n += kSimd4Width) {
+      Simd4 left, right;
+      load_simd4(&a[column][n], left);
+      ((load_simd4(&a[column + after][n], right), total[after] += left * right), ...);
     }
-  ((sums[after] += sum_of(total[after])), ...);
+  ((sums[after] += sum(total[after])), ...);
 }
 
-/// Add the Gram matrix of the columns, upper triangle by rows.
+/// Add the Gram matrix of the columns, upper triangle by rows: row `column` has kColumns - column entries.
 template <int column>
 UNI4D_FG_INLINE void add_gram(const Scratch& a, int rows, double* sums) {
   add_products<column>(a, rows, sums, std::make_integer_sequence<int, kColumns - column>());
@@ -124,7 +125,7 @@ UNI4D_FG_INLINE void tile_sums(const Pose& relative, const Intrinsics& k, double
                                double* sums) {
   alignas(64) Scratch a;
   tile_columns<kind>(relative, k, threshold, in, a);
-  const int padded = (in.rows + kLanes - 1) / kLanes * kLanes;
+  const int padded = (in.rows + kSimd4Width - 1) / kSimd4Width * kSimd4Width;
   for (int n = in.rows; n < padded; ++n)
     for (int j = 0; j < kColumns; ++j) a[j][n] = a[j][kTileRows + n] = 0.0;
   add_gram<0>(a, padded, sums);
@@ -134,11 +135,16 @@ UNI4D_FG_CLONES double energy_of_tile(const Pose& relative, const Intrinsics& k,
                                       const TileInput& in) {
   const double c = kernel.threshold;
   switch (kernel.kind) {
-    case KernelKind::huber: return tile_energy<KernelKind::huber>(relative, k, c, in);
-    case KernelKind::pseudo_huber: return tile_energy<KernelKind::pseudo_huber>(relative, k, c, in);
-    case KernelKind::cauchy: return tile_energy<KernelKind::cauchy>(relative, k, c, in);
-    case KernelKind::norm: return tile_energy<KernelKind::norm>(relative, k, c, in);
-    default: return tile_energy<KernelKind::quadratic>(relative, k, c, in);
+    case KernelKind::huber:
+      return tile_energy<KernelKind::huber>(relative, k, c, in);
+    case KernelKind::pseudo_huber:
+      return tile_energy<KernelKind::pseudo_huber>(relative, k, c, in);
+    case KernelKind::cauchy:
+      return tile_energy<KernelKind::cauchy>(relative, k, c, in);
+    case KernelKind::norm:
+      return tile_energy<KernelKind::norm>(relative, k, c, in);
+    default:
+      return tile_energy<KernelKind::quadratic>(relative, k, c, in);
   }
 }
 
@@ -146,11 +152,16 @@ UNI4D_FG_CLONES void sums_of_tile(const Pose& relative, const Intrinsics& k, con
                                   double* sums) {
   const double c = kernel.threshold;
   switch (kernel.kind) {
-    case KernelKind::huber: return tile_sums<KernelKind::huber>(relative, k, c, in, sums);
-    case KernelKind::pseudo_huber: return tile_sums<KernelKind::pseudo_huber>(relative, k, c, in, sums);
-    case KernelKind::cauchy: return tile_sums<KernelKind::cauchy>(relative, k, c, in, sums);
-    case KernelKind::norm: return tile_sums<KernelKind::norm>(relative, k, c, in, sums);
-    default: return tile_sums<KernelKind::quadratic>(relative, k, c, in, sums);
+    case KernelKind::huber:
+      return tile_sums<KernelKind::huber>(relative, k, c, in, sums);
+    case KernelKind::pseudo_huber:
+      return tile_sums<KernelKind::pseudo_huber>(relative, k, c, in, sums);
+    case KernelKind::cauchy:
+      return tile_sums<KernelKind::cauchy>(relative, k, c, in, sums);
+    case KernelKind::norm:
+      return tile_sums<KernelKind::norm>(relative, k, c, in, sums);
+    default:
+      return tile_sums<KernelKind::quadratic>(relative, k, c, in, sums);
   }
 }
 
@@ -172,8 +183,8 @@ PairSystem::PairSystem(int num_poses, const PairRows& rows, const Kernel& kernel
     return std::pair(rows.source[a], rows.target[a]) < std::pair(rows.source[b], rows.target[b]);
   };
   if (!std::is_sorted(order.begin(), order.end(), before)) std::stable_sort(order.begin(), order.end(), before);
-  for (std::vector<double>* array : {&u_source_, &v_source_, &depth_, &u_target_, &v_target_, &inverse_sigma_u_,
-                                     &inverse_sigma_v_, &weight_})
+  for (std::vector<double>* array :
+       {&u_source_, &v_source_, &depth_, &u_target_, &v_target_, &inverse_sigma_u_, &inverse_sigma_v_, &weight_})
     array->resize(count);
   for (std::size_t i = 0; i < count; ++i) {
     const std::size_t n = order[i];
@@ -204,9 +215,7 @@ std::vector<Pose> PairSystem::relative_poses(const double* poses) const {
   return relative;
 }
 
-int PairSystem::workers() const {
-  return useful_threads(threads_, static_cast<int>(weight_.size()), kRowsPerThread);
-}
+int PairSystem::workers() const { return useful_threads(threads_, static_cast<int>(weight_.size()), kRowsPerThread); }
 
 double PairSystem::energy(const double* poses, const double* intrinsics) const {
   const Intrinsics k = load_intrinsics(intrinsics);
@@ -218,8 +227,9 @@ double PairSystem::energy(const double* poses, const double* intrinsics) const {
     for (int i = begin; i < end; ++i) {
       const Tile& tile = tiles_[static_cast<std::size_t>(i)];
       const auto at = static_cast<std::size_t>(tile.begin);
-      const TileInput in{&u_source_[at],        &v_source_[at],        &depth_[at],  &u_target_[at], &v_target_[at],
-                         &inverse_sigma_u_[at], &inverse_sigma_v_[at], &weight_[at], tile.end - tile.begin};
+      const TileInput in{&u_source_[at],        &v_source_[at], &depth_[at],
+                         &u_target_[at],        &v_target_[at], &inverse_sigma_u_[at],
+                         &inverse_sigma_v_[at], &weight_[at],   tile.end - tile.begin};
       sum += energy_of_tile(relative[static_cast<std::size_t>(tile.pair)], k, kernel_, in);
     }
     partial[static_cast<std::size_t>(worker)] = sum;
@@ -238,8 +248,9 @@ void PairSystem::linearize(const double* poses, const double* intrinsics, double
     for (int i = begin; i < end; ++i) {
       const Tile& tile = tiles_[static_cast<std::size_t>(i)];
       const auto at = static_cast<std::size_t>(tile.begin);
-      const TileInput in{&u_source_[at],        &v_source_[at],        &depth_[at],  &u_target_[at], &v_target_[at],
-                         &inverse_sigma_u_[at], &inverse_sigma_v_[at], &weight_[at], tile.end - tile.begin};
+      const TileInput in{&u_source_[at],        &v_source_[at], &depth_[at],
+                         &u_target_[at],        &v_target_[at], &inverse_sigma_u_[at],
+                         &inverse_sigma_v_[at], &weight_[at],   tile.end - tile.begin};
       sums_of_tile(relative[static_cast<std::size_t>(tile.pair)], k, kernel_, in, sums + kSums * tile.pair);
     }
   });
@@ -247,7 +258,8 @@ void PairSystem::linearize(const double* poses, const double* intrinsics, double
     for (std::size_t i = 0; i < width; ++i) partial[i] += partial[width * static_cast<std::size_t>(worker) + i];
   std::fill(hessian, hessian + static_cast<std::size_t>(size_) * static_cast<std::size_t>(size_), 0.0);
   std::fill(gradient, gradient + size_, 0.0);
-  for (std::size_t i = 0; i < pairs_.size(); ++i) spread(pairs_[i], relative[i], &partial[kSums * i], hessian, gradient);
+  for (std::size_t i = 0; i < pairs_.size(); ++i)
+    spread(pairs_[i], relative[i], &partial[kSums * i], hessian, gradient);
 }
 
 void PairSystem::spread(const Pair& pair, const Pose& target_T_source, const double* sums, double* hessian,

@@ -22,8 +22,15 @@ std::vector<T> permuted(const std::vector<T>& values, const std::vector<std::int
   return out;
 }
 
+// Lists of unequal length ("the factors of each chunk") are stored one after another: list i from start[i] up to
+// start[i + 1]. They are filled as in a counting sort: count the members of list i at start[i + 1], sum up, and then
+// place each member at next[i]++, where next begins as a copy of the starts. Members keep their order, so that later
+// sums are always the same.
+
 /// Turn counts stored at [i + 1] into starts, in place.
-void accumulate_starts(std::vector<std::int32_t>& starts) { std::partial_sum(starts.begin(), starts.end(), starts.begin()); }
+void accumulate_starts(std::vector<std::int32_t>& starts) {
+  std::partial_sum(starts.begin(), starts.end(), starts.begin());
+}
 
 }  // namespace
 
@@ -82,8 +89,8 @@ std::int32_t TrajectorySystem::camera_index(const double* world_T_cam, const dou
   return last_camera_ = count;
 }
 
-void TrajectorySystem::add_dynamic_reprojection(const TrajectoryRows& rows, const double* uv,
-                                                const double* world_T_cam, const double* intrinsics) {
+void TrajectorySystem::add_dynamic_reprojection(const TrajectoryRows& rows, const double* uv, const double* world_T_cam,
+                                                const double* intrinsics) {
   Batch batch = make_batch(rows, Kind::kReprojection, 1, 2);
   batch.observed.assign(uv, uv + 2 * rows.count);
   for (std::int64_t i = 0; i < rows.count; ++i) {
@@ -107,17 +114,16 @@ void TrajectorySystem::add_smoothness(const TrajectoryRows& rows, int slots) {
   batches_.push_back(make_batch(rows, Kind::kSmoothness, slots, 3));
 }
 
-void TrajectorySystem::add_arap(const TrajectoryRows& rows) {
-  batches_.push_back(make_batch(rows, Kind::kArap, 4, 1));
-}
+void TrajectorySystem::add_arap(const TrajectoryRows& rows) { batches_.push_back(make_batch(rows, Kind::kArap, 4, 1)); }
 
 void TrajectorySystem::plan() {
   plan_chunks();
   for (Batch& batch : batches_) {
-    if (batch.kind != Kind::kArap) plan_inside(batch);
+    if (batch.kind != Kind::kArap && batch.kind != Kind::kLinearized) plan_inside(batch);
   }
   plan_edges();
   plan_arap_blocks();
+  plan_uses();
   const auto points = static_cast<std::size_t>(num_points_);
   for (auto* values : {&gradient_, &added_}) values->assign(3 * points, 0.0);
   inside_.assign(18 * points, 0.0);
@@ -128,9 +134,10 @@ void TrajectorySystem::plan() {
 
 void TrajectorySystem::reweight(int batch, const double* weight, const Kernel& kernel) {
   Batch& target = batches_[static_cast<std::size_t>(batch)];
+  linearized_ = false;
+  if (target.kind == Kind::kLinearized) return;  // its arrays come with weights and kernels applied
   target.kernel = kernel;
   for (std::size_t i = 0; i < target.weight.size(); ++i) target.weight[i] = weight[target.original[i]];
-  linearized_ = false;
 }
 
 /// Cut the tracks into chunks of about the same number of points, whatever the number of threads.
@@ -158,14 +165,18 @@ bool TrajectorySystem::complete(const std::int32_t* rows, int slots) const {
   return true;
 }
 
-/// Order a batch by track; smoothness factors that couple beyond the bands go last.
+/// Order a batch by chunk of tracks; smoothness factors that couple tracks, or points beyond the bands, go last.
+///
+/// Such a factor could write to any chunk: they get a group of their own behind the last chunk, which one thread works
+/// on.
 void TrajectorySystem::plan_inside(Batch& batch) {
   const auto count = static_cast<std::size_t>(batch.size());
   const auto slots = static_cast<std::size_t>(batch.slots);
   std::vector<std::int32_t> chunk_of_track(track_start_.size());
   for (std::int32_t chunk = 0; chunk < num_chunks_; ++chunk) {
     const auto c = static_cast<std::size_t>(chunk);
-    for (std::int32_t t = chunk_tracks_[c]; t < chunk_tracks_[c + 1]; ++t) chunk_of_track[static_cast<std::size_t>(t)] = chunk;
+    for (std::int32_t t = chunk_tracks_[c]; t < chunk_tracks_[c + 1]; ++t)
+      chunk_of_track[static_cast<std::size_t>(t)] = chunk;
   }
   std::vector<std::int32_t> group(count);
   for (std::size_t i = 0; i < count; ++i) {
@@ -194,9 +205,16 @@ void TrajectorySystem::plan_inside(Batch& batch) {
 }
 
 /// Find the distinct distances of all ARAP factors, ordered by their lower and then their higher row.
+///
+/// Factor f with rows (p0, p1, p2, p3) uses two distances: (p0, p1) is use 2 f and (p2, p3) is use 2 f + 1, in the same
+/// order as the pairs in `rows`. Uses of the same two rows are one edge. Afterwards:
+///     edges of lower row p       low_start_[p] .. low_start_[p + 1], edges themselves (they are sorted by it)
+///     edges of higher row p      high_edge_[high_start_[p] .. high_start_[p + 1]]
+///     factors of edge e          entries_[entry_start_[e] .. entry_start_[e + 1]], each with its factor's other edge
+///     edges of factor f          factor_now_[f], factor_after_[f]
 void TrajectorySystem::plan_edges() {
   const auto points = static_cast<std::size_t>(num_points_);
-  std::vector<std::int32_t> low, high;  // of every use of a distance: two per factor
+  std::vector<std::int32_t> low, high;  // rows of every use, two uses per factor
   std::int32_t factors = 0;
   for (Batch& batch : batches_) {
     if (batch.kind != Kind::kArap) continue;
@@ -219,6 +237,7 @@ void TrajectorySystem::plan_edges() {
   low_start_.assign(points + 1, 0);
   for (std::size_t p = 0; p < points; ++p) {
     const auto begin = uses.begin() + start[p], end = uses.begin() + start[p + 1];
+    // Uses of one lower row, by higher row: equal ones are neighbors then, and the first of them opens an edge.
     std::sort(begin, end, [&](std::int32_t a, std::int32_t b) {
       const std::int32_t p_a = high[static_cast<std::size_t>(a)], p_b = high[static_cast<std::size_t>(b)];
       return p_a != p_b ? p_a < p_b : a < b;
@@ -240,7 +259,8 @@ void TrajectorySystem::plan_edges() {
   high_edge_.resize(edges);
   next.assign(high_start_.begin(), high_start_.end() - 1);
   for (std::size_t e = 0; e < edges; ++e) {
-    high_edge_[static_cast<std::size_t>(next[static_cast<std::size_t>(edge_high_[e])]++)] = static_cast<std::int32_t>(e);
+    high_edge_[static_cast<std::size_t>(next[static_cast<std::size_t>(edge_high_[e])]++)] =
+        static_cast<std::int32_t>(e);
   }
   factor_now_.resize(count);
   factor_after_.resize(count);
@@ -279,6 +299,10 @@ bool TrajectorySystem::regular(std::int32_t factor) const {
 }
 
 /// Plan the products of ARAP's two directions at the points of one track.
+///
+/// A regular factor joins points (p, m) of two tracks at one frame with (p', m') at a later or earlier one. Its J^T J
+/// has a block p' x p within the first track and m' x m within the second, one or two rows off the diagonal: two
+/// entries, each listed with the later of its two points. Pass one counts, pass two fills.
 void TrajectorySystem::plan_arap_blocks() {
   const std::size_t count = factor_now_.size();
   factor_regular_.assign(count, 0);
@@ -301,7 +325,8 @@ void TrajectorySystem::plan_arap_blocks() {
         if (counting) {
           ++lag_start_[later + 1];
         } else {
-          lag_entries_[static_cast<std::size_t>(next[later]++)] = {factor, q > p, static_cast<std::int8_t>(std::abs(p - q))};
+          lag_entries_[static_cast<std::size_t>(next[later]++)] = {factor, q > p,
+                                                                   static_cast<std::int8_t>(std::abs(p - q))};
         }
       }
     }

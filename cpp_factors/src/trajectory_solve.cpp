@@ -4,7 +4,7 @@
 #include <cmath>
 
 #include "uni4d_fg/parallel.hpp"
-#include "uni4d_fg/team.hpp"
+#include "uni4d_fg/thread_team.hpp"
 #include "uni4d_fg/trajectory_system.hpp"
 
 namespace uni4d_fg {
@@ -67,10 +67,17 @@ std::pair<std::size_t, std::size_t> TrajectorySystem::chunk_points(int chunk) co
 }
 
 /// Factor the damped blocks of the tracks of a chunk. False when one is not positive definite.
+///
+/// A track's matrix A is block pentadiagonal, and so is its Cholesky factor L, A = L L^T. With point p's blocks A_0 on
+/// the diagonal, A_1 to the point before and A_2 to the one before that:
+///     L_2(p) = A_2 L_0(p-2)^{-T}
+///     L_1(p) = (A_1 - L_2(p) L_1(p-1)^T) L_0(p-1)^{-T}
+///     L_0(p) L_0(p)^T = A_0 - L_1(p) L_1(p)^T - L_2(p) L_2(p)^T
+/// A point's 24 values are L_0^{-1} (6), L_1 (9) and L_2 (9).
 bool TrajectorySystem::factorize_chunk(int chunk, double damping, double min_diagonal, double max_diagonal) {
   const auto [begin, end] = chunk_points(chunk);
   bool positive = true;
-  double rows[3][24];  // of this point and the two before it, in double precision
+  double rows[3][24];  // of points p, p - 1 and p - 2 at p % 3, (p + 2) % 3 and (p + 1) % 3, in double precision
   for (std::size_t p = begin; p < end; ++p) {
     const double* block = &blocks_[24 * p];
     double* own = rows[p % 3];
@@ -115,7 +122,8 @@ bool TrajectorySystem::factorize_chunk(int chunk, double damping, double min_dia
   return positive;
 }
 
-/// result = (L L^T)^-1 vector for the points of a chunk.
+/// result = (L L^T)^{-1} vector for the points of a chunk: forwards through the tracks with L^{-1}, backwards with
+/// L^{-T}. Backwards, a point is divided by its own block first and then subtracted from the two before it.
 void TrajectorySystem::precondition_chunk(int chunk, const double* vector, double* result) const {
   const auto [begin, end] = chunk_points(chunk);
   for (std::size_t p = begin; p < end; ++p) {
@@ -142,7 +150,7 @@ void TrajectorySystem::precondition_chunk(int chunk, const double* vector, doubl
   }
 }
 
-/// One solve: its vectors, and the steps that a team shares. Sums run over chunks, in order.
+/// One solve: its vectors, and the steps that a team of threads shares. Sums run over chunks, in order.
 class TrajectorySystem::ConjugateGradients {
  public:
   explicit ConjugateGradients(const TrajectorySystem& system)
@@ -151,10 +159,16 @@ class TrajectorySystem::ConjugateGradients {
         change_(system.edge_low_.size()),
         tension_(system.edge_low_.size()),
         loose_(system.loose_stiffness_.empty() ? 0 : size_),
+        linearized_(system.linearized_rows_),
         partial_(static_cast<std::size_t>(system.num_chunks_)) {}
 
   /// result = (J^T J + added) vector; returns the sum of vector * result. Contains three barriers.
-  double multiply(const double* vector, const double* added, double* result, int worker, Team& team) {
+  ///
+  /// ARAP in three passes, u_e the direction of edge e, w_f the weight of factor f on edges e and e':
+  ///     change c_e = u_e . (v_low - v_high)
+  ///     tension t_e = sum of w_f (c_e - c_e') over the factors of e; edge_stiffness_ is the sum of the w_f
+  ///     a point gets t_e u_e from the edges of which it is the lower end, and -t_e u_e from the others.
+  double multiply(const double* vector, const double* added, double* result, int worker, ThreadTeam& team) {
     const TrajectorySystem& s = system_;
     if (worker == 0 && !loose_.empty()) {
       std::fill(loose_.begin(), loose_.end(), 0.0);
@@ -169,25 +183,29 @@ class TrajectorySystem::ConjugateGradients {
       const double* d = &s.direction_[3 * e];
       change_[e] = d[0] * (a[0] - b[0]) + d[1] * (a[1] - b[1]) + d[2] * (a[2] - b[2]);
     }
+    if (!linearized_.empty()) s.linearized_changes(vector, worker, team.size(), linearized_.data());
     team.wait();
     for (std::size_t e = first; e < last; ++e) {
       double tension = s.edge_stiffness_[e] * change_[e];
       for (std::int32_t i = s.entry_start_[e]; i < s.entry_start_[e + 1]; ++i) {
         const Entry& entry = s.entries_[static_cast<std::size_t>(i)];
-        tension -= s.factor_weight_[static_cast<std::size_t>(entry.factor)] * change_[static_cast<std::size_t>(entry.other)];
+        tension -=
+            s.factor_weight_[static_cast<std::size_t>(entry.factor)] * change_[static_cast<std::size_t>(entry.other)];
       }
       tension_[e] = tension;
     }
     team.wait();
     for_chunks(worker, team, [&](int chunk) {
-      partial_[static_cast<std::size_t>(chunk)] = multiply_chunk(chunk, vector, added, result);
+      partial_[static_cast<std::size_t>(chunk)] = linearized_.empty()
+                                                      ? multiply_chunk<false>(chunk, vector, added, result)
+                                                      : multiply_chunk<true>(chunk, vector, added, result);
     });
     team.wait();
     return sum(partial_);
   }
 
   /// Solve; the result is in `x`, the residual in `r`. Returns the number of steps.
-  int solve(double tolerance, int max_iterations, int worker, Team& team) {
+  int solve(double tolerance, int max_iterations, int worker, ThreadTeam& team) {
     const TrajectorySystem& s = system_;
     if (worker == 0) {
       for (auto* values : {&x, &z_, &p_, &product_}) values->assign(size_, 0.0);
@@ -228,7 +246,7 @@ class TrajectorySystem::ConjugateGradients {
 
  private:
   template <typename F>
-  void for_chunks(int worker, const Team& team, F f) const {
+  void for_chunks(int worker, const ThreadTeam& team, F f) const {
     const int end = range_begin(system_.num_chunks_, team.size(), worker + 1);
     for (int chunk = range_begin(system_.num_chunks_, team.size(), worker); chunk < end; ++chunk) f(chunk);
   }
@@ -241,18 +259,20 @@ class TrajectorySystem::ConjugateGradients {
     residuals_[static_cast<std::size_t>(chunk)] = product;
   }
 
+  template <bool kLinearized>
   double multiply_chunk(int chunk, const double* vector, const double* added, double* result) const {
     const TrajectorySystem& s = system_;
     const auto [begin, end] = s.chunk_points(chunk);
     double product = 0.0;
     for (std::size_t p = begin; p < end; ++p) {
-      const double* own = &s.inside_[18 * p];
+      const double* own = &s.inside_[18 * p];  // to itself, to p - 1 at 6, to p - 2 at 12
       const double* v = vector + 3 * p;
       double out[3] = {0.0, 0.0, 0.0};
       add_symmetric_product(own, v, out);
       // Couplings are stored with the later point, and are zero where that is of the next track.
       if (p >= begin + 1) add_symmetric_product(own + 6, v - 3, out);
       if (p >= begin + 2) add_symmetric_product(own + 12, v - 6, out);
+      // What couples p with later points stands with those: one and two points on, 18 values each.
       if (p + 1 < end) add_symmetric_product(own + 18 + 6, v + 3, out);
       if (p + 2 < end) add_symmetric_product(own + 36 + 12, v + 6, out);
       for (auto e = static_cast<std::size_t>(s.low_start_[p]); e < static_cast<std::size_t>(s.low_start_[p + 1]); ++e) {
@@ -262,6 +282,7 @@ class TrajectorySystem::ConjugateGradients {
         const auto e = static_cast<std::size_t>(s.high_edge_[static_cast<std::size_t>(i)]);
         for (std::size_t a = 0; a < 3; ++a) out[a] -= tension_[e] * s.direction_[3 * e + a];
       }
+      if constexpr (kLinearized) s.add_linearized_products(p, linearized_.data(), out);
       for (std::size_t a = 0; a < 3; ++a) {
         if (added != nullptr) out[a] += added[3 * p + a] * v[a];
         if (!loose_.empty()) out[a] += loose_[3 * p + a];
@@ -276,13 +297,15 @@ class TrajectorySystem::ConjugateGradients {
   std::size_t size_;
   std::vector<double> change_, tension_;  ///< Of every edge: its change along a vector, and what that pulls.
   std::vector<double> loose_;
+  std::vector<double> linearized_;  ///< J v of all batches of add_linearized.
   std::vector<double> partial_, residuals_;
   std::vector<double> z_, p_, product_;
 };
 
 void TrajectorySystem::multiply(const double* vector, double* result) const {
   ConjugateGradients work(*this);
-  Team::run(useful_threads(threads_, num_chunks_, 2), [&](int worker, Team& team) { work.multiply(vector, nullptr, result, worker, team); });
+  ThreadTeam::run(useful_threads(threads_, num_chunks_, 2),
+                  [&](int worker, ThreadTeam& team) { work.multiply(vector, nullptr, result, worker, team); });
 }
 
 std::optional<TrajectoryStep> TrajectorySystem::solve(double damping, double min_diagonal, double max_diagonal,
@@ -290,7 +313,7 @@ std::optional<TrajectoryStep> TrajectorySystem::solve(double damping, double min
   ConjugateGradients work(*this);
   std::atomic<bool> positive{true};
   TrajectoryStep step;
-  Team::run(useful_threads(threads_, num_chunks_, 2), [&](int worker, Team& team) {
+  ThreadTeam::run(useful_threads(threads_, num_chunks_, 2), [&](int worker, ThreadTeam& team) {
     const int end = range_begin(num_chunks_, team.size(), worker + 1);
     for (int chunk = range_begin(num_chunks_, team.size(), worker); chunk < end; ++chunk) {
       if (!factorize_chunk(chunk, damping, min_diagonal, max_diagonal)) positive = false;

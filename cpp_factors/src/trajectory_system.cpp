@@ -21,16 +21,16 @@ constexpr int kRowOf[6] = {0, 0, 0, 1, 1, 2};
 constexpr int kColumnOf[6] = {0, 1, 2, 1, 2, 2};
 
 UNI4D_FG_INLINE const double* smoothness_jacobian(int slots) {
-  return slots == 2 ? temporal_smoothness::kVelocityJacobian : temporal_smoothness::kAccelerationJacobian;
+  return slots == 2 ? VelocitySmoothness::kJacobian : AccelerationSmoothness::kJacobian;
 }
 
 UNI4D_FG_INLINE void smoothness_residual(const double* points, const std::int32_t* rows, int slots, double* r) {
   const double* a = points + 3 * rows[0];
   const double* b = points + 3 * rows[1];
   if (slots == 2) {
-    temporal_smoothness::velocity_residual(load_vec3(a), load_vec3(b), r);
+    VelocitySmoothness::residual(load_vec3(a), load_vec3(b), r);
   } else {
-    temporal_smoothness::acceleration_residual(load_vec3(a), load_vec3(b), load_vec3(points + 3 * rows[2]), r);
+    AccelerationSmoothness::residual(load_vec3(a), load_vec3(b), load_vec3(points + 3 * rows[2]), r);
   }
 }
 
@@ -63,22 +63,24 @@ std::vector<double> TrajectorySystem::energies(const double* points) const {
   parallel_for(edge_ranges, useful_threads(threads_, edge_ranges, kRangeGrain), [&](int begin, int end, int) {
     const std::size_t stop = std::min(edge_low_.size(), static_cast<std::size_t>(end) * kRangeSize);
     for (std::size_t e = static_cast<std::size_t>(begin) * kRangeSize; e < stop; ++e) {
-      distance_[e] = arap::smooth_distance(load_vec3(points + 3 * edge_low_[e]) - load_vec3(points + 3 * edge_high_[e]));
+      distance_[e] =
+          arap::smooth_distance(load_vec3(points + 3 * edge_low_[e]) - load_vec3(points + 3 * edge_high_[e]));
     }
   });
   // Every range of factors has its own sum, added in order below.
   std::vector<std::int32_t> first_range(1, 0);
   for (const Batch& batch : batches_) first_range.push_back(first_range.back() + num_ranges(batch.weight.size()));
   std::vector<double> sums(static_cast<std::size_t>(first_range.back()));
-  parallel_for(first_range.back(), useful_threads(threads_, first_range.back(), kRangeGrain), [&](int begin, int end, int) {
-    for (int range = begin; range < end; ++range) {
-      const auto index = static_cast<std::size_t>(
-          std::upper_bound(first_range.begin(), first_range.end(), range) - first_range.begin() - 1);
-      const std::int32_t start = (range - first_range[index]) * kRangeSize;
-      sums[static_cast<std::size_t>(range)] =
-          energy_of(batches_[index], start, std::min(start + kRangeSize, batches_[index].size()), points);
-    }
-  });
+  parallel_for(
+      first_range.back(), useful_threads(threads_, first_range.back(), kRangeGrain), [&](int begin, int end, int) {
+        for (int range = begin; range < end; ++range) {
+          const auto index = static_cast<std::size_t>(std::upper_bound(first_range.begin(), first_range.end(), range) -
+                                                      first_range.begin() - 1);
+          const std::int32_t start = (range - first_range[index]) * kRangeSize;
+          sums[static_cast<std::size_t>(range)] =
+              energy_of(batches_[index], start, std::min(start + kRangeSize, batches_[index].size()), points);
+        }
+      });
   std::vector<double> out(batches_.size(), 0.0);
   for (std::size_t b = 0; b < batches_.size(); ++b) {
     for (std::int32_t range = first_range[b]; range < first_range[b + 1]; ++range) {
@@ -91,6 +93,7 @@ std::vector<double> TrajectorySystem::energies(const double* points) const {
 double TrajectorySystem::energy_of(const Batch& batch, std::int32_t begin, std::int32_t end,
                                    const double* points) const {
   double sum = 0.0;
+  if (batch.kind == Kind::kLinearized) return sum;  // the caller knows it
   for (std::int32_t i = begin; i < end; ++i) {
     const auto n = static_cast<std::size_t>(i);
     const double* inverse_sigma = &batch.inverse_sigma[n * static_cast<std::size_t>(batch.dim)];
@@ -98,8 +101,8 @@ double TrajectorySystem::energy_of(const Batch& batch, std::int32_t begin, std::
     switch (batch.kind) {
       case Kind::kReprojection: {
         const FrozenCamera& camera = cameras_[static_cast<std::size_t>(batch.camera[n])];
-        dynamic_reprojection::residual(camera.pose, load_vec3(points + 3 * batch.rows[n]), camera.intrinsics,
-                                       &batch.observed[2 * n], r);
+        DynamicReprojection::residual(load_vec3(points + 3 * batch.rows[n]), {&batch.observed[2 * n]}, camera.pose,
+                                      camera.intrinsics, r);
         squared = whiten<2>(r, inverse_sigma);
         break;
       }
@@ -115,9 +118,13 @@ double TrajectorySystem::energy_of(const Batch& batch, std::int32_t begin, std::
         break;
       case Kind::kArap: {
         const std::size_t f = static_cast<std::size_t>(batch.first_factor) + n;
-        r[0] = distance_[static_cast<std::size_t>(factor_now_[f])] - distance_[static_cast<std::size_t>(factor_after_[f])];
+        r[0] =
+            distance_[static_cast<std::size_t>(factor_now_[f])] - distance_[static_cast<std::size_t>(factor_after_[f])];
         squared = whiten<1>(r, inverse_sigma);
+        break;
       }
+      case Kind::kLinearized:
+        break;
     }
     sum += batch.weight[n] * rho(batch.kernel, squared);
   }
@@ -135,14 +142,16 @@ NonFinite TrajectorySystem::linearize(const double* points, double kernel_curvat
   parallel_for(num_chunks_, useful_threads(threads_, num_chunks_, kRangeGrain), [&](int begin, int end, int worker) {
     for (int chunk = begin; chunk < end; ++chunk) {
       for (std::size_t b = 0; b < batches_.size(); ++b) {
-        if (batches_[b].kind != Kind::kArap) {
+        if (batches_[b].kind != Kind::kArap && batches_[b].kind != Kind::kLinearized) {
           linearize_inside(batches_[b], static_cast<int>(b), chunk, points, kernel_curvature,
                            bad[static_cast<std::size_t>(worker)]);
         }
       }
       gather_arap(chunk);
+      gather_linearized(chunk);
     }
   });
+  for (Batch& batch : batches_) batch.set = false;
   add_irregular_arap();
   loose_stiffness_.clear();
   for (std::size_t b = 0; b < batches_.size(); ++b) {
@@ -174,19 +183,22 @@ void TrajectorySystem::linearize_arap(double kernel_curvature, std::vector<NonFi
   for (std::size_t b = 0; b < batches_.size(); ++b) {
     const Batch& batch = batches_[b];
     if (batch.kind != Kind::kArap) continue;
-    parallel_for(batch.size(), useful_threads(threads_, batch.size(), kRangeGrain * kRangeSize), [&](int begin, int end, int worker) {
-      for (int i = begin; i < end; ++i) {
-        const auto n = static_cast<std::size_t>(i), f = n + static_cast<std::size_t>(batch.first_factor);
-        const double r = distance_[static_cast<std::size_t>(factor_now_[f])] -
-                         distance_[static_cast<std::size_t>(factor_after_[f])];
-        // A direction is not finite only if its distance is not.
-        if (!std::isfinite(r)) bad[static_cast<std::size_t>(worker)].merge({static_cast<int>(b), batch.original[n]});
-        const double inverse_sigma = batch.inverse_sigma[n], squared = r * inverse_sigma * r * inverse_sigma;
-        const double scale = batch.weight[n] * weight(batch.kernel, squared) * inverse_sigma * inverse_sigma;
-        factor_force_[f] = scale * r;
-        factor_weight_[f] = scale * (1.0 - kernel_curvature * falloff(batch.kernel, squared));
-      }
-    });
+    parallel_for(
+        batch.size(), useful_threads(threads_, batch.size(), kRangeGrain * kRangeSize),
+        [&](int begin, int end, int worker) {
+          for (int i = begin; i < end; ++i) {
+            const auto n = static_cast<std::size_t>(i), f = n + static_cast<std::size_t>(batch.first_factor);
+            const double r = distance_[static_cast<std::size_t>(factor_now_[f])] -
+                             distance_[static_cast<std::size_t>(factor_after_[f])];
+            // A direction is not finite only if its distance is not.
+            if (!std::isfinite(r))
+              bad[static_cast<std::size_t>(worker)].merge({static_cast<int>(b), batch.original[n]});
+            const double inverse_sigma = batch.inverse_sigma[n], squared = r * inverse_sigma * r * inverse_sigma;
+            const double scale = batch.weight[n] * weight(batch.kernel, squared) * inverse_sigma * inverse_sigma;
+            factor_force_[f] = scale * r;
+            factor_weight_[f] = scale * (1.0 - kernel_curvature * falloff(batch.kernel, squared));
+          }
+        });
   }
 }
 
@@ -233,7 +245,7 @@ void TrajectorySystem::linearize_inside(const Batch& batch, int batch_index, int
           const std::int32_t lag = rows[s] - rows[t];
           if (lag < 0) continue;
           const double product = factor[s] * factor[t];
-          for (int i = 0; i < 6; ++i) own[6 * lag + i] += product * stiffness[i];
+          for (int entry = 0; entry < 6; ++entry) own[6 * lag + entry] += product * stiffness[entry];
         }
       }
       continue;
@@ -242,7 +254,7 @@ void TrajectorySystem::linearize_inside(const Batch& batch, int batch_index, int
     const FrozenCamera& camera = cameras_[static_cast<std::size_t>(batch.camera[n])];
     const Vec3 point = load_vec3(points + 3 * row);
     if (batch.kind == Kind::kReprojection) {
-      dynamic_reprojection::linearize(camera.pose, point, camera.intrinsics, &batch.observed[2 * n], r, jacobian);
+      DynamicReprojection::linearize(point, {&batch.observed[2 * n]}, camera.pose, camera.intrinsics, r, jacobian);
     } else {
       depth_prior::linearize_point(camera.pose, point, 0.0, batch.observed[n], r, jacobian);
     }
@@ -337,7 +349,8 @@ void TrajectorySystem::add_irregular_arap() {
     const auto f = static_cast<std::size_t>(factor);
     const auto now = static_cast<std::size_t>(factor_now_[f]), after = static_cast<std::size_t>(factor_after_[f]);
     const std::int32_t rows[4] = {edge_low_[now], edge_high_[now], edge_low_[after], edge_high_[after]};
-    const double* directions[4] = {&direction_[3 * now], &direction_[3 * now], &direction_[3 * after], &direction_[3 * after]};
+    const double* directions[4] = {&direction_[3 * now], &direction_[3 * now], &direction_[3 * after],
+                                   &direction_[3 * after]};
     const double signs[4] = {1.0, -1.0, -1.0, 1.0};
     const bool all_lags = complete(rows, 4);
     for (int i = 0; i < 4; ++i) {
@@ -365,9 +378,9 @@ void TrajectorySystem::linearize_loose(const Batch& batch, int batch_index, cons
     for (int s = 0; s < batch.slots; ++s) {
       for (std::size_t a = 0; a < 3; ++a) gradient_[3 * static_cast<std::size_t>(rows[s]) + a] += factor[s] * pull[a];
       for (int t = 0; t < batch.slots; ++t) {
-        for (int i = 0; i < 6; ++i) {
-          const double product = factor[s] * factor[t] * stiffness[i];
-          const int row = kRowOf[i], column = kColumnOf[i];
+        for (int entry = 0; entry < 6; ++entry) {
+          const double product = factor[s] * factor[t] * stiffness[entry];
+          const int row = kRowOf[entry], column = kColumnOf[entry];
           add_block(rows[s], rows[t], all_lags, product, unit[row], unit[column]);
           if (row != column) add_block(rows[s], rows[t], all_lags, product, unit[column], unit[row]);
         }

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from test_boundary import spoil
 from uni4d_fg_cpp import _core
 
-from uni4d_fg.factors.depth_prior import static_linearize
-from uni4d_fg.factors.static_reprojection import linearize
+from uni4d_fg.factors.depth_prior import static_depth_prior
+from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.geometry import se3
 
 FRAMES, LANDMARKS, COUNT = 4, 9, 30
 STATE = ("world_T_cam", "intrinsics", "log_scale", "landmarks")
 MAY_BE_NAN = {"uv", "depth", *STATE, "core", "border", "corner", "gradient", "camera_step"}
-"""Values that are not finite pass here: the linearisation reports them, and the solver names the variables."""
+"""Values that are not finite pass here: the linearization reports them, and the solver names the variables."""
 Arguments = dict[str, Any]
 
 
@@ -65,9 +65,9 @@ def dense_jacobian(plan: Arguments, state: Arguments) -> tuple[np.ndarray, np.nd
     size = 7 * (FRAMES - 1)
     pose, point = state["world_T_cam"][plan["pose"]], state["landmarks"][plan["landmark"]]
     intrinsics = np.broadcast_to(state["intrinsics"], (COUNT, 4))
-    r, (by_pose, by_point, by_intrinsics) = linearize(pose, point, intrinsics, uv=plan["uv"])
+    r, (by_pose, by_point, by_intrinsics) = static_reprojection.linearize(pose, point, intrinsics, uv=plan["uv"])
     scale = state["log_scale"][plan["pose"], None]
-    r_depth, (pose_depth, point_depth, by_scale) = static_linearize(pose, point, scale, depth=plan["depth"])
+    r_depth, (pose_depth, point_depth, by_scale) = static_depth_prior.linearize(pose, point, scale, depth=plan["depth"])
     jacobian, residual = np.zeros((3 * COUNT, size + 4 + 3 * LANDMARKS)), np.zeros(3 * COUNT)
     for n in range(COUNT):
         row, factor = slice(3 * n, 3 * n + 3), np.sqrt(plan["weight"][n]) / plan["sigma"][n]

@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 from uni4d_fg_cpp import _core
 
 from uni4d_fg.factors.batch import FactorBatch, Slot
-from uni4d_fg.factors.depth_reprojection import DEPTH_REPROJECTION
+from uni4d_fg.factors.depth_reprojection import depth_reprojection
 from uni4d_fg.factors.kernels import Kernel
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import INTRINSICS, POSE
 from uni4d_fg.geometry import se3
-from uni4d_fg.graph.state import State
 
 KERNELS = ("quadratic", "huber", "pseudo_huber", "cauchy", "norm")
 NUM_POSES = 5
@@ -26,14 +27,14 @@ def make_batch(rng: np.random.Generator, count: int, kind: str, shuffled: bool) 
     target = other + (other >= source)
     state = State(
         {
-            "pose": se3.se3_exp(rng.normal(size=(NUM_POSES, 6)) * 0.15),
-            "intrinsics": np.array([[510.0, 490.0, 320.0, 240.0]]),
+            POSE: se3.se3_exp(rng.normal(size=(NUM_POSES, 6)) * 0.15),
+            INTRINSICS: np.array([[510.0, 490.0, 320.0, 240.0]]),
         }
     )
     uv = rng.uniform(0, 600, (count, 2))
     batch = FactorBatch.create(
-        DEPTH_REPROJECTION,
-        (Slot("pose", source), Slot("pose", target), Slot("intrinsics", np.zeros(count, dtype=np.int64))),
+        depth_reprojection,
+        (Slot(POSE, source), Slot(POSE, target), Slot(INTRINSICS, np.zeros(count, dtype=np.int64))),
         {"uv_source": uv, "depth": rng.uniform(0.3, 6, count), "uv_target": uv + rng.normal(size=(count, 2)) * 40},
         sigma=rng.uniform(0.5, 30, (count, 2) if count % 2 else count),
         weight=rng.uniform(0, 2, count),
@@ -66,7 +67,7 @@ def dense(batch: FactorBatch, state: State, columns: np.ndarray) -> tuple[np.nda
     full = np.zeros((*r.shape, NUM_POSES * 6 + 4))
     rows = np.arange(len(batch))
     for slot, jacobian in zip(batch.slots, jacobians, strict=True):
-        start = 6 * NUM_POSES if slot.group == "intrinsics" else 6 * slot.rows
+        start = 6 * NUM_POSES if slot.variable is INTRINSICS else 6 * slot.rows
         for i in range(jacobian.shape[2]):
             full[rows, :, start + i] += jacobian[:, :, i]
     free = np.flatnonzero(columns >= 0)
@@ -92,7 +93,7 @@ def test_energy_hessian_and_gradient(seed: int, count: int, kind: str, shuffled:
     columns = np.full(len(free), -1)
     columns[free] = np.arange(free.sum())
     system = system_of(batch, columns, threads)
-    poses, intrinsics = state["pose"], state["intrinsics"][0]
+    poses, intrinsics = state[POSE], state[INTRINSICS][0]
     assert system.energy(poses, intrinsics) == pytest.approx(batch.energy(state), rel=1e-11)
     hessian, gradient = system.linearize(poses, intrinsics)
     expected_hessian, expected_gradient = dense(batch, state, columns)
@@ -105,7 +106,7 @@ def test_energy_hessian_and_gradient(seed: int, count: int, kind: str, shuffled:
 def test_same_result_on_every_call_and_near_equal_for_any_number_of_threads() -> None:
     batch, state = make_batch(np.random.default_rng(0), 20001, "huber", False)
     columns = np.arange(NUM_POSES * 6 + 4)
-    poses, intrinsics = state["pose"], state["intrinsics"][0]
+    poses, intrinsics = state[POSE], state[INTRINSICS][0]
     reference, _ = system_of(batch, columns, 1).linearize(poses, intrinsics)
     for threads in (1, 2, 3):
         system = system_of(batch, columns, threads)

@@ -1,22 +1,24 @@
-"""Batch kernels against the NumPy implementation: random states, singular points, behind the camera."""
+"""Batch kernels against NumPy and against differences: random states, singular points, behind the camera."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from families import FAMILIES, arguments_of, split_arguments
+from families import TWINS, TYPES, Arguments, arguments_of, retract, split_arguments
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from uni4d_fg_cpp import _core
 
 from uni4d_fg.factors.batch import FactorBatch, Slot
 from uni4d_fg.factors.kernels import Kernel
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import NEAR_PLANE
-from uni4d_fg.graph.state import State
 
 KERNELS = ("quadratic", "huber", "pseudo_huber", "cauchy", "norm")
 TOLERANCE = 1e-10
+STEP = 1e-6
 
 
 def assert_close(actual: np.ndarray, expected: np.ndarray) -> None:
@@ -27,32 +29,52 @@ def assert_close(actual: np.ndarray, expected: np.ndarray) -> None:
     np.testing.assert_array_less(np.abs(actual - expected) / scale, TOLERANCE)
 
 
-def check(name: str, arguments: dict[str, np.ndarray], threads: int = 1) -> None:
+def check(name: str, arguments: Arguments, threads: int = 1) -> None:
     variables, data = split_arguments(name, arguments)
-    family = FAMILIES[name]
-    expected_r, expected_jacobians = family.linearize(*variables, **data)
-    r = getattr(_core, f"{name}_residual")(*variables, **data, threads=threads)
-    assert_close(r, np.asarray(family.residual(*variables, **data)))
-    r, jacobians = getattr(_core, f"{name}_linearize")(*variables, **data, threads=threads)
+    twin = TWINS[name]
+    expected_r, expected_jacobians = twin.linearize(*variables, **data)
+    assert_close(_core.residual(name, variables, data, threads), np.asarray(twin.residual(*variables, **data)))
+    r, jacobians = _core.linearize(name, variables, data, threads)
     assert_close(r, expected_r)
     assert len(jacobians) == len(expected_jacobians)
     for actual, expected in zip(jacobians, expected_jacobians, strict=True):
         assert_close(actual, np.asarray(expected))
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", TWINS)
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 40), threads=st.integers(0, 3))
 def test_random_states(name: str, seed: int, count: int, threads: int) -> None:
     check(name, arguments_of(name, np.random.default_rng(seed), count), threads)
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", TYPES)
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobians_are_the_derivatives_of_the_residual(name: str, seed: int) -> None:
+    """By central differences on the manifolds that a type declares; this needs no twin in NumPy."""
+    variables, data = split_arguments(name, arguments_of(name, np.random.default_rng(seed), 30))
+    r, jacobians = _core.linearize(name, variables, data)
+    assert_close(_core.residual(name, variables, data), r)
+    for i, (variable, jacobian) in enumerate(zip(TYPES[name]["variables"], jacobians, strict=True)):
+        dim = TYPES[name]["tangents"][variable]
+        assert jacobian.shape == (30, TYPES[name]["dim"], dim)
+        slopes = np.empty_like(jacobian)
+        for k in range(dim):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = list(variables)
+                moved[i] = np.ascontiguousarray(retract(variables[i], sign * STEP * np.eye(dim)[None, k]))
+                ends.append(_core.residual(name, moved, data))
+            slopes[:, :, k] = (ends[0] - ends[1]) / (2.0 * STEP)
+        scale = np.maximum(np.abs(slopes).max(axis=(1, 2), keepdims=True), np.abs(r).max(axis=1)[:, None, None])
+        np.testing.assert_array_less(np.abs(jacobian - slopes) / (scale + 1.0), 1e-5)
+
+
+@pytest.mark.parametrize("name", TYPES)
 def test_many_rows_on_several_threads_equal_one_thread(name: str) -> None:
     variables, data = split_arguments(name, arguments_of(name, np.random.default_rng(1), 9001))
-    linearize = getattr(_core, f"{name}_linearize")
-    r, jacobians = linearize(*variables, **data, threads=1)
-    r_many, jacobians_many = linearize(*variables, **data, threads=4)
+    r, jacobians = _core.linearize(name, variables, data, threads=1)
+    r_many, jacobians_many = _core.linearize(name, variables, data, threads=4)
     np.testing.assert_array_equal(r, r_many)
     for one, many in zip(jacobians, jacobians_many, strict=True):
         np.testing.assert_array_equal(one, many)
@@ -108,17 +130,17 @@ def test_whitening_equals_that_of_a_batch(
     rng = np.random.default_rng(seed)
     arguments = arguments_of("static_reprojection", rng, 30)
     # Residuals from far below to far above the threshold.
-    r, jacobians = FAMILIES["static_reprojection"].linearize(*split_arguments("static_reprojection", arguments)[0],
+    r, jacobians = TWINS["static_reprojection"].linearize(*split_arguments("static_reprojection", arguments)[0],
                                                              uv=arguments["uv"])  # fmt: skip
     sigma = 10.0 ** rng.uniform(-1, 1, (30, 2) if per_component else 30) * 10.0**-log_scale
     weight = rng.uniform(0, 2, 30) * (rng.random(30) > 0.2)
     state = State(
-        {"pose": arguments["world_T_cam"], "landmark": arguments["landmark"], "intrinsics": arguments["intrinsics"]}
+        {POSE: arguments["world_T_cam"], LANDMARK: arguments["landmark"], INTRINSICS: arguments["intrinsics"]}
     )
     rows = np.arange(30)
     batch = FactorBatch.create(
-        FAMILIES["static_reprojection"],
-        tuple(Slot(group, rows) for group in ("pose", "landmark", "intrinsics")),
+        TWINS["static_reprojection"],
+        tuple(Slot(variable, rows) for variable in (POSE, LANDMARK, INTRINSICS)),
         {"uv": arguments["uv"]},
         sigma=sigma,
         weight=weight,

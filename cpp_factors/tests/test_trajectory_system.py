@@ -12,25 +12,26 @@ from hypothesis import strategies as st
 from uni4d_fg_cpp import _core
 
 from uni4d_fg.config.solver import SolverConfig
-from uni4d_fg.factors.arap import ARAP
+from uni4d_fg.factors.arap import arap
 from uni4d_fg.factors.batch import FactorBatch, Slot
-from uni4d_fg.factors.depth_prior import DYNAMIC_DEPTH_PRIOR
-from uni4d_fg.factors.dynamic_reprojection import DYNAMIC_REPROJECTION
+from uni4d_fg.factors.depth_prior import dynamic_depth_prior
+from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection
 from uni4d_fg.factors.kernels import Kernel
-from uni4d_fg.factors.temporal_smoothness import ACCELERATION_SMOOTHNESS, VELOCITY_SMOOTHNESS
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness, velocity_smoothness
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT
 from uni4d_fg.geometry import se3
-from uni4d_fg.graph.problem import Problem, all_free
-from uni4d_fg.graph.state import State, VariableNames
-from uni4d_fg.solve.trajectory_cg import TrajectoryObjective
+from uni4d_fg.optim.problem import Problem, all_free
+from uni4d_fg.optim.trajectory_cg import TrajectoryObjective
 
 KERNELS = ("quadratic", "huber", "pseudo_huber", "cauchy", "norm")
 EXACT = SolverConfig(cg_tolerance=1e-12, cg_max_iterations=5000)
 ADD = {
-    id(DYNAMIC_REPROJECTION): "add_dynamic_reprojection",
-    id(DYNAMIC_DEPTH_PRIOR): "add_dynamic_depth_prior",
-    id(VELOCITY_SMOOTHNESS): "add_smoothness",
-    id(ACCELERATION_SMOOTHNESS): "add_smoothness",
-    id(ARAP): "add_arap",
+    dynamic_reprojection: "add_dynamic_reprojection",
+    dynamic_depth_prior: "add_dynamic_depth_prior",
+    velocity_smoothness: "add_smoothness",
+    acceleration_smoothness: "add_smoothness",
+    arap: "add_arap",
 }
 
 
@@ -43,16 +44,16 @@ def make_problem(seed: int, lengths: list[int], kernel: str, *, scrambled: bool,
     if count > 1:
         points[-1] = points[0]  # coinciding points
     names = np.stack([5 * track, np.concatenate([np.arange(n) for n in lengths])], axis=1)
-    state = State({"dynamic_point": points}, VariableNames(dynamic_track_frame=names))
+    state = State({DYNAMIC_POINT: points}, {DYNAMIC_POINT: names})
     poses = se3.se3_exp(0.1 * rng.normal(size=(4, 6)))
 
     def batch(family: Any, rows: list[np.ndarray], data: dict[str, np.ndarray]) -> FactorBatch:
         n = len(rows[0])
         return FactorBatch.create(
             family,
-            tuple(Slot("dynamic_point", r) for r in rows),
+            tuple(Slot(DYNAMIC_POINT, r) for r in rows),
             data,
-            sigma=rng.uniform(0.5, 2.0, (n, family.residual_dim) if seed % 2 else n),
+            sigma=rng.uniform(0.5, 2.0, (n, family.dim) if seed % 2 else n),
             weight=rng.uniform(0.1, 2.0, n),
             kernel=Kernel(kernel, 0.3),  # type: ignore[arg-type]
         )
@@ -61,17 +62,17 @@ def make_problem(seed: int, lengths: list[int], kernel: str, *, scrambled: bool,
     intrinsics = np.tile([300.0, 310.0, 160.0, 120.0], (count, 1))
     batches = [
         batch(
-            DYNAMIC_REPROJECTION,
+            dynamic_reprojection,
             [own],
             {"uv": rng.uniform(0, 300, (count, 2)), "world_T_cam": poses[camera], "intrinsics": intrinsics},
         ),
         batch(
-            DYNAMIC_DEPTH_PRIOR,
+            dynamic_depth_prior,
             [own],
             {"depth": rng.uniform(1, 5, count), "world_T_cam": poses[camera], "log_scale": rng.normal(size=count)},
         ),
     ]
-    for family, slots in ((VELOCITY_SMOOTHNESS, 2), (ACCELERATION_SMOOTHNESS, 3), (ARAP, 4)):
+    for family, slots in ((velocity_smoothness, 2), (acceleration_smoothness, 3), (arap, 4)):
         if scrambled:
             rows = [rng.integers(0, count, 12) for _ in range(slots)]
         elif slots == 4:
@@ -87,11 +88,11 @@ def make_problem(seed: int, lengths: list[int], kernel: str, *, scrambled: bool,
             rows = [first + i for i in range(slots)]
         if len(rows[0]):
             batches.append(batch(family, rows, {}))
-    return Problem(tuple(batches), all_free(state, "dynamic_point")), state
+    return Problem(tuple(batches), all_free(state, DYNAMIC_POINT)), state
 
 
 def add(system: _core.TrajectorySystem, batch: FactorBatch) -> None:
-    getattr(system, ADD[id(batch.family)])(
+    getattr(system, ADD[batch.factor_type])(
         rows=[s.rows for s in batch.slots],
         **{name: np.ascontiguousarray(array) for name, array in batch.data.items()},
         sigma=np.ascontiguousarray(batch.sigma),
@@ -102,9 +103,7 @@ def add(system: _core.TrajectorySystem, batch: FactorBatch) -> None:
 
 
 def system_of(problem: Problem, state: State, threads: int = 2) -> _core.TrajectorySystem:
-    names = state.names.dynamic_track_frame
-    assert names is not None
-    system = _core.TrajectorySystem(np.ascontiguousarray(names[:, 0]), threads)
+    system = _core.TrajectorySystem(np.ascontiguousarray(state.numbers(DYNAMIC_POINT)[:, 0]), threads)
     for batch in problem.batches:
         add(system, batch)
     system.plan()
@@ -130,7 +129,7 @@ def test_parity_with_numpy(
     problem, state = make_problem(seed, lengths, kernel, scrambled=scrambled, behind=behind)
     config = EXACT.model_copy(update={"kernel_curvature": curvature})
     system, reference = system_of(problem, state), TrajectoryObjective(problem, state, config, threads=1)
-    points = state["dynamic_point"]
+    points = state[DYNAMIC_POINT]
     expected = [batch.energy(state) for batch in problem.batches]
     np.testing.assert_allclose(system.energies(points), expected, rtol=1e-12, atol=1e-12 * max(expected))
     gradient, failure = system.linearize(points, curvature)
@@ -154,7 +153,7 @@ def test_parity_with_numpy(
 @pytest.mark.parametrize("scrambled", [False, True])
 def test_other_weights_and_kernels_need_no_new_plan(scrambled: bool) -> None:
     problem, state = make_problem(4, [9, 3, 7, 8], "huber", scrambled=scrambled, behind=False)
-    system, points = system_of(problem, state), state["dynamic_point"]
+    system, points = system_of(problem, state), state[DYNAMIC_POINT]
     system.linearize(points)
     rng = np.random.default_rng(0)
     kernels = [Kernel("norm", 0.2), Kernel("cauchy", 2.0), Kernel(), Kernel("huber", 0.1), Kernel("pseudo_huber", 1.0)]
@@ -185,9 +184,9 @@ def test_every_number_of_threads_gives_the_same_bits() -> None:
     results = []
     for threads in (1, 2, 3, 2):
         system = system_of(problem, state, threads)
-        gradient, _ = system.linearize(state["dynamic_point"])
+        gradient, _ = system.linearize(state[DYNAMIC_POINT])
         delta, *rest = system.solve(1e-3, 1e-6, 1e32, 1e-3, 100)
-        results.append((system.energies(state["dynamic_point"]), gradient, delta, np.array(rest)))
+        results.append((system.energies(state[DYNAMIC_POINT]), gradient, delta, np.array(rest)))
     for other in results[1:]:
         for mine, theirs in zip(results[0], other, strict=True):
             np.testing.assert_array_equal(mine, theirs)
@@ -195,7 +194,7 @@ def test_every_number_of_threads_gives_the_same_bits() -> None:
 
 def test_the_first_factor_that_is_not_finite_is_reported() -> None:
     problem, state = make_problem(5, [6, 7, 8], "huber", scrambled=False, behind=False)
-    system, points = system_of(problem, state), state["dynamic_point"].copy()
+    system, points = system_of(problem, state), state[DYNAMIC_POINT].copy()
     points[4, 1] = np.nan
     _, failure = system.linearize(points)
     assert failure == (0, int(np.flatnonzero(problem.batches[0].slots[0].rows == 4)[0]))
@@ -291,13 +290,13 @@ def test_malformed_arrays_are_refused_by_name(index: int, spoil: str) -> None:
         # When one of several lengths differs, another argument may be called wrong.
         blamed = None if spoil == "length" else name.replace("[", r"\[").replace("]", r"\]")
         with pytest.raises(ValueError, match=blamed):
-            getattr(system, ADD[id(batch.family)])(**arguments, kernel=1, threshold=1.0)
+            getattr(system, ADD[batch.factor_type])(**arguments, kernel=1, threshold=1.0)
 
 
 @pytest.mark.parametrize("spoil", ["dtype", "extra axis", "length", "strides"])
 def test_malformed_points_and_vectors_are_refused(spoil: str) -> None:
     problem, state = make_problem(1, [5, 5, 5], "huber", scrambled=False, behind=False)
-    system, points = system_of(problem, state), state["dynamic_point"]
+    system, points = system_of(problem, state), state[DYNAMIC_POINT]
     for call in (system.energies, system.linearize):
         with pytest.raises(ValueError, match=r"points: expected float64 \(15, 3\)"):
             call(MALFORMED[spoil](points))

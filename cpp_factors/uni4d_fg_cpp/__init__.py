@@ -1,11 +1,33 @@
 """C++ factors and linear solvers for uni4d_fg; NumPy arrays in, NumPy arrays out.
 
-Everything is in the compiled module ``_core``: ``<family>_residual`` and ``<family>_linearize`` for every factor
-family, ``whiten`` and ``robust_energy`` for noise and robust kernels, and the systems that solve the stages. Arrays
-are float64 (row numbers int64) and C-contiguous; a ValueError or TypeError names the argument that is not.
+Everything is in the compiled module ``_core``: ``factor_types`` lists the factor types that have a kernel,
+``residual`` and ``linearize`` run one by its name, ``whiten`` and ``robust_energy`` apply noise and robust kernels,
+and the systems solve the stages. Arrays are float64 (row numbers int64) and C-contiguous; a ValueError or TypeError
+names the argument that is not.
 """
 
 from uni4d_fg_cpp import _core
-from uni4d_fg_cpp._core import ABI, LandmarkSystem, PairSystem, TrajectorySystem, robust_energy, whiten
+from uni4d_fg_cpp._core import (
+    ABI,
+    LandmarkSystem,
+    PairSystem,
+    TrajectorySystem,
+    factor_types,
+    linearize,
+    residual,
+    robust_energy,
+    whiten,
+)
 
-__all__ = ["ABI", "LandmarkSystem", "PairSystem", "TrajectorySystem", "_core", "robust_energy", "whiten"]
+__all__ = [
+    "ABI",
+    "LandmarkSystem",
+    "PairSystem",
+    "TrajectorySystem",
+    "_core",
+    "factor_types",
+    "linearize",
+    "residual",
+    "robust_energy",
+    "whiten",
+]

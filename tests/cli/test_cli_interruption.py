@@ -44,7 +44,7 @@ def test_an_interrupted_run_ends_cleanly_and_resumes(tmp_path: Path) -> None:
     program = (
         "import sys, time\n"
         "from uni4d_fg.cli import main\n"
-        "from uni4d_fg.tracks import lucas_kanade\n"
+        "from uni4d_fg.frontend.tracks import lucas_kanade\n"
         "move = lucas_kanade.move_points\n"
         "def slow_move(*args, **options):\n"
         "    print('moving', flush=True)\n"

@@ -18,10 +18,10 @@ from onnx import TensorProto, helper, numpy_helper
 from uni4d_fg.cli import main
 from uni4d_fg.cli.runs import stored_input
 from uni4d_fg.cues.gather import NOT_METRIC
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.sequence.read import read_sequence
-from uni4d_fg.sequence.write import write_native
-from uni4d_fg.synthetic import SyntheticSceneConfig
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.read import read_sequence
+from uni4d_fg.frontend.sequence.write import write_native
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig
 
 pytest.importorskip("open3d")
 
@@ -33,7 +33,7 @@ SCENE = SyntheticSceneConfig(num_frames=10, width=160, height=120, focal=150.0, 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sequence folder, and clip.mp4 of its frames beside it."""
-    from uni4d_fg.synthetic import make_synthetic_sequence
+    from uni4d_fg.frontend.synthetic import make_synthetic_sequence
 
     folder = tmp_path_factory.mktemp("video") / "room"
     sequence = make_synthetic_sequence(SCENE)

@@ -15,7 +15,7 @@ from uni4d_fg.config.describe import describe_fields, field_paths, find_field
 from uni4d_fg.config.load import dump_config, load_config, preset_names, presets_folder, with_overrides
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import ConfigError
-from uni4d_fg.synthetic import SyntheticSceneConfig
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig
 
 
 def write(path: Path, text: str) -> Path:
@@ -36,7 +36,7 @@ def test_presets_are_valid_and_known(name: str) -> None:
 
 def test_the_paper_preset_has_the_numbers_of_the_reference_program() -> None:
     config = load_config("paper")
-    assert (config.energy, config.normalization) == ("unsquared", "mean")
+    assert (config.energy, config.normalization) == ("paper", "mean")
     assert config.camera_init.window == 5
     assert config.camera_init.max_tracks_per_pair == 0
     for motion in (config.camera_init.camera_motion, config.bundle_adjustment.camera_motion):
@@ -81,7 +81,7 @@ def test_a_section_keeps_what_its_parent_gave_it(tmp_path: Path) -> None:
 def test_a_file_names_its_preset_and_overrides_come_last(tmp_path: Path) -> None:
     path = write(tmp_path / "mine.yaml", "preset: paper\nnonrigid:\n  neighbours: 5\n  arap_weight: 50.0\n")
     config = load_config(path, ["nonrigid.neighbours=6"])
-    assert (config.nonrigid.neighbours, config.nonrigid.arap_weight, config.energy) == (6, 50.0, "unsquared")
+    assert (config.nonrigid.neighbours, config.nonrigid.arap_weight, config.energy) == (6, 50.0, "paper")
 
 
 def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_a_preset_wins_over_a_file_of_its_name(tmp_path: Path, monkeypatch: pyte
         ("nonrigid.depth_sigma=null", None),
         ("nonrigid.bridge_gaps=false", False),
         ("nonrigid.annealing=[10, 1]", (10.0, 1.0)),
-        ("energy=unsquared", "unsquared"),
+        ("normalization=sum", "sum"),
         (" camera_init . window = 7", 7),
     ],
 )
@@ -136,7 +136,7 @@ def test_an_override_can_give_a_whole_section() -> None:
         ("camera_init.window='4'", ['camera_init.window: got "4"', "an integer"]),
         ("camera_init.window=1.5", ["camera_init.window: got 1.5", "an integer"]),
         ("output.clouds=1", ["output.clouds: got 1", "true or false"]),
-        ("energy=both", ['got "both"', "one of map, unsquared"]),
+        ("energy=both", ['got "both"', "one of map, paper"]),
         ("nonrigid.annealing=[1, x]", ["nonrigid.annealing", '"x" in the list', "a list of numbers"]),
         ("nonrigid.depth_sigma=.nan", ["nonrigid.depth_sigma: got nan", "finite"]),
         ("input.max_depth_m=.inf", ["input.max_depth_m: got inf", "finite"]),
@@ -216,6 +216,41 @@ def test_every_field_says_what_it_means_and_takes() -> None:
         assert "class" not in field.allowed, field.path
         assert find_field(Config, tuple(field.path.split("."))) is not None
     assert "nonrigid.solver.max_iterations" in set(field_paths(Config))
+
+
+@pytest.mark.parametrize(
+    ("preset", "override", "found"),
+    [
+        (
+            "default",
+            "energy=paper",
+            ["camera_init.kernel.kind=huber", "bundle_adjustment.reprojection_kernel.kind=huber"]
+            + [f"nonrigid.{term}_kernel.kind=huber" for term in ("reprojection", "smoothness", "arap")]
+            + ["measure_noise=true", "bundle_adjustment.depth_prior=true", "nonrigid.depth_prior=true"],
+        ),
+        ("default", "nonrigid.depth_kernel.kind=norm", ["energy 'map'", "nonrigid.depth_kernel.kind=norm"]),
+        ("paper", "energy=map", ["camera_init.kernel.kind=norm", "nonrigid.arap_kernel.kind=norm"]),
+        ("paper", "nonrigid.depth_prior=true", ["energy 'paper'", "nonrigid.depth_prior=true"]),
+        ("paper", "nonrigid.arap_kernel.kind=cauchy", ["nonrigid.arap_kernel.kind=cauchy"]),
+    ],
+)
+def test_a_mixture_of_the_energies_is_one_error_that_lists_what_contradicts(
+    preset: str, override: str, found: list[str]
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(preset, [override])
+    for part in [*found, "--config paper"]:
+        assert part in str(caught.value)
+    assert str(caught.value).count("kind=") == sum("kind=" in part for part in found) or preset == "paper"
+    assert "\n" not in str(caught.value)
+
+
+def test_either_energy_may_lose_a_term_and_change_its_numbers() -> None:
+    paper = load_config("paper", ["nonrigid.arap_weight=0", "nonrigid.arap_kernel.threshold=0.01"])
+    paper = with_overrides(paper, ["nonrigid.annealing=[1]", "nonrigid.depth_kernel.kind=cauchy", "solver=adam"])
+    assert (paper.energy, paper.nonrigid.arap_weight, paper.nonrigid.annealing) == ("paper", 0.0, (1.0,))
+    robust = load_config("default", ["nonrigid.depth_prior=false", "nonrigid.arap_kernel.kind=cauchy"])
+    assert not robust.nonrigid.depth_prior
 
 
 @settings(max_examples=60, deadline=None)

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from uni4d_fg.config.geometric_depth import AffineDepthConfig
 from uni4d_fg.cues.affine_depth import AffineAlignment, align_affine
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
-from uni4d_fg.sequence.model import ArrayFrames
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.frontend.sequence.model import ArrayFrames
+from uni4d_fg.frontend.track_model import Tracks
 
 FRAMES, POINTS, HEIGHT, WIDTH = 6, 120, 60, 80
 

@@ -23,9 +23,9 @@ from uni4d_fg.cues.manifest import has_manifest, load_cues
 from uni4d_fg.cues.plan import CueFiles, CuePlan, plan_cues
 from uni4d_fg.errors import Cancelled, ConfigError, InputError, OutputError
 from uni4d_fg.files import save_npy, save_npz
-from uni4d_fg.sequence.decode import read_mask
-from uni4d_fg.sequence.model import ArrayFrames, Sequence, Video
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.frontend.sequence.decode import read_mask
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence, Video
+from uni4d_fg.frontend.track_model import Tracks
 
 CONFIG = load_config("fast", ["networks.threads=1", "tracking.grid_columns=12", "tracking.grid_rows=10"])
 SIZE = (40, 56)
@@ -353,7 +353,7 @@ ROOM_CONFIG = load_config("fast", ["input.intrinsics=fixed", "tracking.grid_colu
 def room() -> Video:
     """Frames of a static scene with its truth, and a calibration."""
     pytest.importorskip("open3d")
-    from uni4d_fg.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+    from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 
     config = SyntheticSceneConfig(num_frames=10, width=160, height=120, focal=150.0, objects="none", frame_rate=5.0)
     scene = make_synthetic_sequence(config)

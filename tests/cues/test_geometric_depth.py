@@ -11,6 +11,7 @@ import pytest
 from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.load import load_config
+from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion, settings_for_geometry
 from uni4d_fg.cues.interpolated_depth import (
     SparseInverseDepth,
@@ -21,12 +22,11 @@ from uni4d_fg.cues.interpolated_depth import (
     supported,
 )
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
-from uni4d_fg.evaluate.trajectory import evaluate_trajectory, path_length
+from uni4d_fg.frontend.sequence.model import Video
+from uni4d_fg.frontend.synthetic.simulate import Simulation, simulate
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import world_to_camera
-from uni4d_fg.sequence.model import Video
-from uni4d_fg.synthetic.config import SyntheticSceneConfig
-from uni4d_fg.synthetic.simulate import Simulation, simulate
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory, path_length
 
 SIZE: dict[str, Any] = {
     "num_frames": 10, "height": 144, "width": 192, "focal": 180.0, "grid_columns": 20, "grid_rows": 15,
@@ -213,7 +213,7 @@ def test_a_lone_wrong_point_has_no_support(rng: np.random.Generator) -> None:
     uv = rng.uniform(0, 100, (100, 2))
     inverse = plane(uv)
     inverse[7] *= 4.0
-    keep = supported(uv, inverse)
+    keep = supported(uv, inverse, GeometricDepthConfig())
     assert not keep[7]
     assert keep.sum() >= 98
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.geometric_depth import depth_from_motion
-from uni4d_fg.evaluate.trajectory import evaluate_trajectory
-from uni4d_fg.sequence.model import ArrayFrames, Video
-from uni4d_fg.tracks.lucas_kanade import track_grid
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
+from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 
 STRIDE = 3
 

@@ -10,7 +10,7 @@ from uni4d_fg.config.motion_masks import InstanceConfig
 from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.cues.instances import associate_instances, components
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.sequence.model import ArrayFrames
+from uni4d_fg.frontend.sequence.model import ArrayFrames
 
 SIZE = (96, 160)
 

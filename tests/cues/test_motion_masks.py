@@ -20,14 +20,14 @@ from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
 from uni4d_fg.cues.track_motion import Cameras, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.evaluate.alignment import align_trajectories
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
+from uni4d_fg.frontend.sequence.read import read_sequence
+from uni4d_fg.frontend.synthetic import Simulation, SyntheticSceneConfig, simulate
+from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
+from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
 from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.alignment import align_trajectories
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
-from uni4d_fg.sequence.model import ArrayFrames, Video
-from uni4d_fg.sequence.read import read_sequence
-from uni4d_fg.synthetic import Simulation, SyntheticSceneConfig, simulate
-from uni4d_fg.tracks.lucas_kanade import track_grid
-from uni4d_fg.tracks.model import LabelledTracks, Tracks
 
 INTRINSICS = np.array([200.0, 210.0, 79.5, 59.5])
 
@@ -127,7 +127,9 @@ def test_evidence_of_pixels(rng: np.random.Generator) -> None:
     zero = np.zeros((120, 160), np.float32)
 
     def evidence(second: np.ndarray, depth: np.ndarray, pose: np.ndarray, edge_px: int = 1) -> np.ndarray:
-        first, other = (frame_appearance(i, d, 0.0, edge_px) for i, d in ((image, depth), (second, near)))
+        first, other = (
+            frame_appearance(i, d, 0.0, edge_px, MotionMaskConfig()) for i, d in ((image, depth), (second, near))
+        )
         return moved_evidence(first, other, pose, INTRINSICS, (zero, zero), MotionMaskConfig())
 
     far = np.full((120, 160), 2.0, np.float32)

@@ -17,7 +17,7 @@ from uni4d_fg.cues.cache import FrameCache
 from uni4d_fg.cues.card import find_model
 from uni4d_fg.cues.point_tracker_network import PointTrackerNetwork, window_starts
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.sequence.model import ArrayFrames
+from uni4d_fg.frontend.sequence.model import ArrayFrames
 
 CONFIG = NetworkConfig(threads=1, grid_columns=4, grid_rows=3, query_interval=6, margin_px=6.0)
 VELOCITY = (0.5, -0.25)

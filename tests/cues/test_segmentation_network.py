@@ -167,7 +167,7 @@ def test_suppression_keeps_the_best_of_each_group() -> None:
 
 @pytest.mark.data
 def test_sinet_finds_the_man_in_front(data_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from uni4d_fg.sequence.decode import read_image
+    from uni4d_fg.frontend.sequence.decode import read_image
 
     models = data_root.parent / "models"
     if not (models / "SINet_Softmax.onnx").is_file():

@@ -12,7 +12,7 @@ from uni4d_fg.cues.structure.triangulation import RayBundle, inverse_depth_sigma
 from uni4d_fg.cues.structure.two_view import fit_rotation, parallax, relative_pose
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, world_to_camera
-from uni4d_fg.stages.observations import Observations
+from uni4d_fg.slam.stages.observations import Observations
 
 K = np.array([300.0, 300.0, 159.5, 119.5])
 
@@ -57,8 +57,8 @@ def test_relative_pose_is_found_among_outliers_and_is_repeatable(rng: np.random.
     pose = moved((0.02, 0.1, -0.03), (0.3, -0.05, 0.1))
     _, first, second = views(rng, pose)
     second[:60] = rng.uniform(0, 300, (60, 2))
-    found = relative_pose(first, second, K, 1.5)
-    again = relative_pose(first, second, K, 1.5)
+    found = relative_pose(first, second, K, 1.5, 5000)
+    again = relative_pose(first, second, K, 1.5, 5000)
     assert found is not None
     assert again is not None
     np.testing.assert_array_equal(found.first_T_second, again.first_T_second)
@@ -86,7 +86,7 @@ def test_noiseless_points_are_triangulated_exactly(seed: int, baseline: float) -
     )
     points, _, _ = views(rng, poses[1], 30)
     uv = np.stack([project(K, world_to_camera(pose, points)) for pose in poses])
-    found = triangulate(bundle(points, poses, uv))
+    found = triangulate(bundle(points, poses, uv), 1.0)
     np.testing.assert_allclose(found.position, points, rtol=1e-5, atol=1e-5)
     assert found.error_px.max() < 1e-3
 
@@ -95,7 +95,7 @@ def test_the_stated_deviation_of_inverse_depth_is_the_real_one(rng: np.random.Ge
     poses = np.stack([np.eye(4), moved((0.0, 0.0, 0.0), (0.2, 0.0, 0.0))])
     points, _, _ = views(rng, poses[1], 1000)
     uv = np.stack([project(K, world_to_camera(pose, points)) for pose in poses]) + rng.normal(0, 0.2, (2, 1000, 2))
-    found = triangulate(bundle(points, poses, uv))
+    found = triangulate(bundle(points, poses, uv), 1.0)
     sigma = inverse_depth_sigma(poses[0], found.position, found.information, 0.2)
     normalized = (1.0 / found.position[:, 2] - 1.0 / points[:, 2]) / sigma
     assert np.std(normalized) == pytest.approx(1.0, abs=0.1)
@@ -107,7 +107,7 @@ def test_parallel_rays_and_points_behind_are_no_points() -> None:
     # Track 0 is seen twice from one place, track 1 by rays that part in front and meet behind.
     row = np.array([0, 0, 1, 1])
     uv = np.array([[100.0, 100.0], [100.0, 100.0], [150.0, 100.0], [200.0, 100.0]])
-    found = triangulate(RayBundle(row, poses[[0, 2, 0, 1]], uv, K, 2))
+    found = triangulate(RayBundle(row, poses[[0, 2, 0, 1]], uv, K, 2), 1.0)
     assert np.isnan(found.position[0]).all()
     assert not sound(found, 3.0, 1.0).any()
 

@@ -1,180 +1,171 @@
-"""Every factor family: analytic Jacobians against torch autograd and central differences, and zero residuals."""
+"""Every declared factor type: analytic Jacobians against torch autograd and central differences, and zero residuals."""
 
 from __future__ import annotations
+
+import ast
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from factor_samples import (
+    N,
+    autograd_jacobian,
+    declared,
+    difference_jacobian,
+    random_case,
+    random_values,
+    random_variable,
+)
 
-from uni4d_fg.factors.arap import ARAP
-from uni4d_fg.factors.camera_motion import CAMERA_ROTATION, CAMERA_TRANSLATION
-from uni4d_fg.factors.depth_prior import DYNAMIC_DEPTH_PRIOR, STATIC_DEPTH_PRIOR
-from uni4d_fg.factors.depth_reprojection import DEPTH_REPROJECTION
-from uni4d_fg.factors.dynamic_reprojection import DYNAMIC_REPROJECTION
-from uni4d_fg.factors.family import FactorFamily
-from uni4d_fg.factors.priors import ASPECT_PRIOR, INTRINSICS_PRIOR, LOG_SCALE_PRIOR, SCALE_ANCHOR
-from uni4d_fg.factors.static_reprojection import STATIC_REPROJECTION
-from uni4d_fg.factors.temporal_smoothness import ACCELERATION_SMOOTHNESS, VELOCITY_SMOOTHNESS
+import uni4d_fg
+from uni4d_fg.errors import SolverError
+from uni4d_fg.factors import FactorType, factor, factor_type, factor_types
+from uni4d_fg.factors.arap import arap
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.depth_prior import dynamic_depth_prior, static_depth_prior
+from uni4d_fg.factors.depth_reprojection import depth_reprojection
+from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection
+from uni4d_fg.factors.static_reprojection import static_reprojection
+from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness, velocity_smoothness
+from uni4d_fg.factors.variable import SE3
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
-from uni4d_fg.graph.state import TANGENT_DIM
 
-N = 6
-
-FAMILIES = [
-    STATIC_REPROJECTION,
-    DYNAMIC_REPROJECTION,
-    DEPTH_REPROJECTION,
-    STATIC_DEPTH_PRIOR,
-    DYNAMIC_DEPTH_PRIOR,
-    ARAP,
-    VELOCITY_SMOOTHNESS,
-    ACCELERATION_SMOOTHNESS,
-    CAMERA_ROTATION,
-    CAMERA_TRANSLATION,
-    ASPECT_PRIOR,
-    INTRINSICS_PRIOR,
-    LOG_SCALE_PRIOR,
-    SCALE_ANCHOR,
-]
-IDS = [f"{f.name}-{len(f.variables)}" for f in FAMILIES]
+TYPES = declared()
+every_type = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])
 
 
-def random_poses(rng: np.random.Generator, scale: float = 0.3) -> np.ndarray:
-    return se3.se3_exp(rng.normal(scale=scale, size=(N, 6)))
+def random_poses(rng: np.random.Generator) -> np.ndarray:
+    return random_values(SE3, rng)
 
 
-def random_variable(group: str, rng: np.random.Generator) -> np.ndarray:
-    if group == "pose":
-        return random_poses(rng)
-    if group == "intrinsics":
-        return rng.uniform([450, 450, 300, 200], [600, 600, 340, 260], size=(N, 4))
-    if group == "log_scale":
-        return rng.normal(scale=0.1, size=(N, 1))
-    return rng.uniform([-1, -1, 2], [1, 1, 5], size=(N, 3))
+def test_every_declaration_of_the_package_is_listed() -> None:
+    names = set()
+    for path in Path(uni4d_fg.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                calls = [d for d in node.decorator_list if isinstance(d, ast.Call) and isinstance(d.func, ast.Name)]
+                names |= {node.name for call in calls if call.func.id == "factor"}
+    assert {kind.residual.__name__ for kind in TYPES} == names
+    assert len(names) >= 14
 
 
-def random_data(name: str, rng: np.random.Generator, family: FactorFamily) -> np.ndarray:
-    if name.startswith("uv"):
-        return rng.uniform([0, 0], [640, 480], size=(N, 2))
-    if name == "world_T_cam":
-        return random_poses(rng)
-    if name == "intrinsics":
-        return random_variable("intrinsics", rng)
-    if name == "log_scale":
-        return rng.normal(scale=0.1, size=N)
-    if name == "floor":
-        return np.full(N, 1e-3)
-    if name == "measured" and family is ASPECT_PRIOR:
-        return rng.normal(scale=0.1, size=N)
-    if name == "measured":
-        return random_variable(family.variables[0], rng)
-    return rng.uniform(1.0, 4.0, size=N)
-
-
-def random_case(family: FactorFamily, seed: int) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
-    rng = np.random.default_rng(seed)
-    return [random_variable(g, rng) for g in family.variables], {d: random_data(d, rng, family) for d in family.data}
-
-
-def retract(group: str, value: np.ndarray, step: np.ndarray) -> np.ndarray:
-    return se3.retract(value, step) if group == "pose" else value + step
-
-
-def numerical_jacobian(family, variables, data, slot, step=1e-6):
-    group = family.variables[slot]
-    columns = []
-    for i in range(TANGENT_DIM[group]):
-        out = []
-        for sign in (1.0, -1.0):
-            d = np.zeros((N, TANGENT_DIM[group]))
-            d[:, i] = sign * step
-            moved = list(variables)
-            moved[slot] = retract(group, variables[slot], d)
-            out.append(family.residual(*moved, **data))
-        columns.append((out[0] - out[1]) / (2 * step))
-    return np.stack(columns, axis=2)
-
-
-def torch_retract(value: torch.Tensor, xi: torch.Tensor) -> torch.Tensor:
-    twist = torch.zeros(N, 4, 4, dtype=torch.float64)
-    generators = torch.zeros(6, 4, 4, dtype=torch.float64)
-    for i, (a, b) in enumerate([(2, 1), (0, 2), (1, 0)]):
-        generators[i, a, b], generators[i, b, a] = 1.0, -1.0
-        generators[3 + i, i, 3] = 1.0
-    twist = torch.einsum("ni,iab->nab", xi, generators)
-    return value @ torch.linalg.matrix_exp(twist)
-
-
-def autograd_jacobian(family, variables, data, slot):
-    group = family.variables[slot]
-    tensors = [torch.from_numpy(v) for v in variables]
-    torch_data = {k: torch.from_numpy(v) for k, v in data.items()}
-    step = torch.zeros(N, TANGENT_DIM[group], dtype=torch.float64, requires_grad=True)
-    moved = list(tensors)
-    moved[slot] = torch_retract(tensors[slot], step) if group == "pose" else tensors[slot] + step
-    r = family.residual(*moved, **torch_data)
-    rows = [torch.autograd.grad(r[:, i].sum(), step, retain_graph=True)[0] for i in range(r.shape[1])]
-    return torch.stack(rows, dim=1).numpy()
-
-
-@pytest.mark.parametrize("family", FAMILIES, ids=IDS)
+@every_type
 @pytest.mark.parametrize("seed", range(4))
-def test_analytic_jacobians_match_autograd_and_central_differences(family: FactorFamily, seed: int) -> None:
-    variables, data = random_case(family, seed)
-    r, jacobians = family.linearize(*variables, **data)
-    np.testing.assert_allclose(r, family.residual(*variables, **data), rtol=1e-12, atol=1e-9)
-    assert r.shape == (N, family.residual_dim)
-    for slot, jacobian in enumerate(jacobians):
+def test_jacobians_match_autograd_and_central_differences(kind: FactorType, seed: int) -> None:
+    variables, data = random_case(kind, seed)
+    r, jacobians = kind.linearize(*variables, **data)
+    np.testing.assert_allclose(r, kind.residual(*variables, **data), rtol=1e-12, atol=1e-9)
+    assert r.shape == (N, kind.dim)
+    assert len(jacobians) == len(kind.variables)
+    exact = 1e-10 if kind.is_analytic else 1e-7
+    for slot, (variable, jacobian) in enumerate(zip(kind.variables, jacobians, strict=True)):
         scale = max(1.0, np.abs(jacobian).max())
-        assert jacobian.shape == (N, family.residual_dim, TANGENT_DIM[family.variables[slot]])
-        np.testing.assert_allclose(jacobian, autograd_jacobian(family, variables, data, slot), atol=1e-10 * scale)
-        np.testing.assert_allclose(jacobian, numerical_jacobian(family, variables, data, slot), atol=2e-6 * scale)
+        assert jacobian.shape == (N, kind.dim, variable.dim)
+        np.testing.assert_allclose(jacobian, autograd_jacobian(kind, variables, data, slot), atol=exact * scale)
+        np.testing.assert_allclose(jacobian, difference_jacobian(kind, variables, data, slot), atol=2e-6 * scale)
 
 
-@pytest.mark.parametrize("family", FAMILIES, ids=IDS)
-def test_numpy_and_torch_residuals_agree(family: FactorFamily) -> None:
-    variables, data = random_case(family, 11)
-    ours = family.residual(*variables, **data)
-    theirs = family.residual(*map(torch.from_numpy, variables), **{k: torch.from_numpy(v) for k, v in data.items()})
+@every_type
+@pytest.mark.parametrize("seed", range(4))
+def test_without_an_analytic_jacobian_there_are_differences(kind: FactorType, seed: int) -> None:
+    """The error is 1e-7 of the largest entry: rounding of the residual over a step of 1e-6."""
+    plain = FactorType("plain", kind.variables, kind.data, kind.dim, kind.residual, listed=False)
+    assert not plain.is_analytic
+    variables, data = random_case(kind, seed)
+    r, jacobians = plain.linearize(*variables, **data)
+    np.testing.assert_array_equal(r, kind.residual(*variables, **data))
+    for slot, jacobian in enumerate(jacobians):
+        exact = autograd_jacobian(kind, variables, data, slot)
+        size = max(1.0, np.abs(exact).max())
+        np.testing.assert_allclose(jacobian, exact, rtol=0.0, atol=1e-7 * size)
+
+
+@every_type
+def test_numpy_and_torch_residuals_agree(kind: FactorType) -> None:
+    variables, data = random_case(kind, 11)
+    ours = kind.residual(*variables, **data)
+    theirs = kind.residual(*map(torch.from_numpy, variables), **{k: torch.from_numpy(v) for k, v in data.items()})
     np.testing.assert_allclose(theirs.numpy(), ours, rtol=1e-12, atol=1e-10)
+
+
+def test_a_declaration_is_a_few_lines(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
+    monkeypatch.setattr(factor_type, "_LISTED", dict(factor_type._LISTED))
+
+    @factor(POSE, data={"xyz": 3}, dim=3)
+    def position_prior(world_T_cam, *, xyz):
+        return world_T_cam[..., :3, 3] - xyz
+
+    assert factor_types()[-1] is position_prior
+    assert not position_prior.is_analytic
+    poses, xyz = random_poses(rng), rng.normal(size=(N, 3))
+    r, (jacobian,) = position_prior.linearize(poses, xyz=xyz)
+    np.testing.assert_allclose(r, poses[:, :3, 3] - xyz)
+    # d c / d v = R for a twist (omega, v) of the body.
+    np.testing.assert_allclose(jacobian, np.concatenate([np.zeros((N, 3, 3)), poses[:, :3, :3]], axis=2), atol=1e-9)
+    batch = position_prior(np.arange(N), xyz=xyz, sigma=0.05, term="marker")
+    assert (len(batch), batch.name, batch.factor_type) == (N, "marker", position_prior)
+
+    @position_prior.jacobian
+    def analytic(world_T_cam, *, xyz):
+        return position_prior.residual(world_T_cam, xyz=xyz), [jacobian]
+
+    assert position_prior.is_analytic
+    assert position_prior.linearize(poses, xyz=xyz)[1][0] is jacobian
+
+
+def test_names_of_types_and_data_are_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(factor_type, "_LISTED", dict(factor_type._LISTED))
+
+    def residual(landmark, **data):
+        return landmark
+
+    with pytest.raises(SolverError, match=r"'arap' is declared in uni4d_fg\.factors\.arap already"):
+        factor(LANDMARK, dim=3, name="arap")(residual)
+    with pytest.raises(SolverError, match="'mine': data may not be called sigma, weight"):
+        factor(LANDMARK, data={"weight": (), "sigma": (), "uv": 2}, dim=3, name="mine")(residual)
+    first, again = (factor(LANDMARK, dim=3, name="mine")(residual) for _ in range(2))
+    assert first is not again
+    assert [kind for kind in factor_types() if kind.name == "mine"] == [again]
 
 
 def test_reprojections_vanish_at_the_truth(rng: np.random.Generator) -> None:
     first, second = random_poses(rng), random_poses(rng)
-    intrinsics = random_variable("intrinsics", rng)
-    x = random_variable("landmark", rng)
+    intrinsics = random_variable(INTRINSICS, rng)
+    x = random_variable(LANDMARK, rng)
     p = camera_to_world(first, x)
     uv, uv_second = project(intrinsics, x), project(intrinsics, world_to_camera(second, p))
     zero = np.zeros((N, 2))
-    np.testing.assert_allclose(STATIC_REPROJECTION.residual(first, p, intrinsics, uv=uv), zero, atol=1e-10)
+    np.testing.assert_allclose(static_reprojection.residual(first, p, intrinsics, uv=uv), zero, atol=1e-10)
     np.testing.assert_allclose(
-        DYNAMIC_REPROJECTION.residual(p, uv=uv, world_T_cam=first, intrinsics=intrinsics), zero, atol=1e-10
+        dynamic_reprojection.residual(p, uv=uv, world_T_cam=first, intrinsics=intrinsics), zero, atol=1e-10
     )
     lifted = {"uv_source": uv, "depth": x[:, 2], "uv_target": uv_second}
-    np.testing.assert_allclose(DEPTH_REPROJECTION.residual(first, second, intrinsics, **lifted), zero, atol=1e-9)
+    np.testing.assert_allclose(depth_reprojection.residual(first, second, intrinsics, **lifted), zero, atol=1e-9)
     np.testing.assert_allclose(unproject(intrinsics, uv, x[:, 2]), x, atol=1e-12)
 
 
 def test_depth_prior_vanishes_when_the_scale_explains_the_cue(rng: np.random.Generator) -> None:
-    pose, p = random_poses(rng), camera_to_world(random_poses(rng), random_variable("landmark", rng))
+    pose, p = random_poses(rng), camera_to_world(random_poses(rng), random_variable(LANDMARK, rng))
     pose[:] = np.eye(4)
     p[:, 2] = np.abs(p[:, 2]) + 0.5
     s = rng.normal(scale=0.1, size=(N, 1))
     cue = p[:, 2] * np.exp(-s[:, 0])
-    np.testing.assert_allclose(STATIC_DEPTH_PRIOR.residual(pose, p, s, depth=cue), 0.0, atol=1e-12)
+    np.testing.assert_allclose(static_depth_prior.residual(pose, p, s, depth=cue), 0.0, atol=1e-12)
     frozen = {"depth": cue, "world_T_cam": pose, "log_scale": s[:, 0]}
-    np.testing.assert_allclose(DYNAMIC_DEPTH_PRIOR.residual(p, **frozen), 0.0, atol=1e-12)
+    np.testing.assert_allclose(dynamic_depth_prior.residual(p, **frozen), 0.0, atol=1e-12)
 
 
 def test_rigid_motion_has_no_arap_energy_and_constant_velocity_no_acceleration(rng: np.random.Generator) -> None:
-    p, q = random_variable("landmark", rng), random_variable("landmark", rng)
+    p, q = random_variable(LANDMARK, rng), random_variable(LANDMARK, rng)
     motion = random_poses(rng)
     moved = [camera_to_world(motion, v) for v in (p, q)]
-    np.testing.assert_allclose(ARAP.residual(p, q, *moved), 0.0, atol=1e-12)
+    np.testing.assert_allclose(arap.residual(p, q, *moved), 0.0, atol=1e-12)
     v = rng.normal(size=(N, 3))
-    np.testing.assert_allclose(ACCELERATION_SMOOTHNESS.residual(p, p + v, p + 2 * v), 0.0, atol=1e-12)
-    np.testing.assert_allclose(VELOCITY_SMOOTHNESS.residual(p, p), 0.0)
+    np.testing.assert_allclose(acceleration_smoothness.residual(p, p + v, p + 2 * v), 0.0, atol=1e-12)
+    np.testing.assert_allclose(velocity_smoothness.residual(p, p), 0.0)
 
 
 def test_constant_relative_motion_has_no_camera_energy(rng: np.random.Generator) -> None:
@@ -183,44 +174,44 @@ def test_constant_relative_motion_has_no_camera_energy(rng: np.random.Generator)
     rotation[:, :3, :3] = se3.so3_exp(rng.normal(scale=0.1, size=(N, 3)))
     poses = [start, start @ rotation, start @ rotation @ rotation]
     floor = np.full(N, 1e-3)
-    np.testing.assert_allclose(CAMERA_ROTATION.residual(*poses, floor=floor), 0.0, atol=1e-9)
+    np.testing.assert_allclose(camera_rotation.residual(*poses, floor=floor), 0.0, atol=1e-9)
     v = rng.normal(scale=0.1, size=(N, 3))
     for i, pose in enumerate(poses):
         pose[:, :3, 3] = start[:, :3, 3] + i * v
-    np.testing.assert_allclose(CAMERA_TRANSLATION.residual(*poses, floor=floor), 0.0, atol=1e-9)
+    np.testing.assert_allclose(camera_translation.residual(*poses, floor=floor), 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("family", [CAMERA_ROTATION, CAMERA_TRANSLATION], ids=["rotation", "translation"])
-def test_camera_at_rest_has_zero_energy_and_finite_jacobians(family: FactorFamily) -> None:
+@pytest.mark.parametrize("kind", [camera_rotation, camera_translation], ids=["rotation", "translation"])
+def test_camera_at_rest_has_zero_energy_and_finite_jacobians(kind: FactorType) -> None:
     rest = np.tile(np.eye(4), (N, 1, 1))
-    r, jacobians = family.linearize(rest, rest, rest, floor=np.full(N, 1e-3))
+    r, jacobians = kind.linearize(rest, rest, rest, floor=np.full(N, 1e-3))
     np.testing.assert_array_equal(r, 0.0)
     variables, data = [rest, rest, rest], {"floor": np.full(N, 1e-3)}
     for slot, jacobian in enumerate(jacobians):
-        np.testing.assert_allclose(jacobian, autograd_jacobian(family, variables, data, slot), atol=1e-8)
+        np.testing.assert_allclose(jacobian, autograd_jacobian(kind, variables, data, slot), atol=1e-8)
         assert np.abs(jacobian).max() <= 2.0 / 1e-3
 
 
 def test_arap_at_coinciding_points_has_zero_gradient(rng: np.random.Generator) -> None:
-    p, q = random_variable("landmark", rng), random_variable("landmark", rng)
-    r, jacobians = ARAP.linearize(p, p, p, q)
+    p, q = random_variable(LANDMARK, rng), random_variable(LANDMARK, rng)
+    r, jacobians = arap.linearize(p, p, p, q)
     assert np.isfinite(r).all()
     np.testing.assert_array_equal(jacobians[0], 0.0)
     np.testing.assert_allclose(np.linalg.norm(jacobians[3], axis=2), 1.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("family", [STATIC_REPROJECTION, STATIC_DEPTH_PRIOR], ids=["reprojection", "depth"])
-def test_behind_the_camera_the_error_is_large_and_pushes_forward(family: FactorFamily) -> None:
+@pytest.mark.parametrize("kind", [static_reprojection, static_depth_prior], ids=["reprojection", "depth"])
+def test_behind_the_camera_the_error_is_large_and_pushes_forward(kind: FactorType) -> None:
     pose = np.tile(np.eye(4), (N, 1, 1))
     intrinsics = np.tile([500.0, 500.0, 320.0, 240.0], (N, 1))
     z = np.linspace(-2.0, -0.01, N)
     p = np.stack([np.full(N, 0.4), np.full(N, -0.3), z], axis=1)
-    variables = [pose, p, intrinsics if family is STATIC_REPROJECTION else np.zeros((N, 1))]
-    data = {"uv": np.tile([350.0, 230.0], (N, 1))} if family is STATIC_REPROJECTION else {"depth": np.full(N, 2.0)}
-    r, jacobians = family.linearize(*variables, **data)
+    variables = [pose, p, intrinsics if kind is static_reprojection else np.zeros((N, 1))]
+    data = {"uv": np.tile([350.0, 230.0], (N, 1))} if kind is static_reprojection else {"depth": np.full(N, 2.0)}
+    r, jacobians = kind.linearize(*variables, **data)
     for slot, jacobian in enumerate(jacobians):
         scale = max(1.0, np.abs(jacobian).max())
-        np.testing.assert_allclose(jacobian, autograd_jacobian(family, variables, data, slot), atol=1e-10 * scale)
+        np.testing.assert_allclose(jacobian, autograd_jacobian(kind, variables, data, slot), atol=1e-10 * scale)
     gradient_z = np.einsum("nd,nd->n", r, jacobians[1][:, :, 2])
     assert (gradient_z < 0).all(), "moving forward must lower the energy"
     energy = np.sum(r**2, axis=1)

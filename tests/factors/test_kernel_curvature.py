@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.factors import FactorBatch, Kernel, Slot
-from uni4d_fg.factors.temporal_smoothness import ACCELERATION_SMOOTHNESS
-from uni4d_fg.graph.state import State
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT
 
 COUNT = 12
 KINDS = ("quadratic", "huber", "pseudo_huber", "cauchy", "norm")
@@ -21,13 +22,13 @@ def smoothness(seed: int, kernel: Kernel, spread: float = 1.0) -> tuple[FactorBa
     """Second differences, which are linear in the points: all that is not linear is the kernel."""
     rng = np.random.default_rng(seed)
     batch = FactorBatch.create(
-        ACCELERATION_SMOOTHNESS,
-        tuple(Slot("dynamic_point", np.arange(i, COUNT - 2 + i)) for i in range(3)),
+        acceleration_smoothness,
+        tuple(Slot(DYNAMIC_POINT, np.arange(i, COUNT - 2 + i)) for i in range(3)),
         sigma=rng.uniform(0.5, 2.0, (COUNT - 2, 3)),
         weight=rng.uniform(0.0, 2.0, COUNT - 2),
         kernel=kernel,
     )
-    return batch, State({"dynamic_point": spread * rng.normal(size=(COUNT, 3))})
+    return batch, State({DYNAMIC_POINT: spread * rng.normal(size=(COUNT, 3))})
 
 
 def normal_equations(batch: FactorBatch, state: State, kernel_curvature: float) -> tuple[FloatArray, FloatArray]:
@@ -51,7 +52,7 @@ def test_it_is_that_part_of_the_way_to_the_hessian(seed: int, kind: str, part: f
         return  # the Hessian jumps at the threshold
     direction = np.random.default_rng(seed + 1).normal(size=(COUNT, 3))
     step = 1e-5 / np.abs(direction).max()
-    ahead, back = (state.replace(dynamic_point=state["dynamic_point"] + s * direction) for s in (step, -step))
+    ahead, back = (state.replace({DYNAMIC_POINT: state[DYNAMIC_POINT] + s * direction}) for s in (step, -step))
     slope = (normal_equations(batch, ahead, 0.0)[1] - normal_equations(batch, back, 0.0)[1]) / (2.0 * step)
     reweighted, gradient = normal_equations(batch, state, 0.0)
     model, same = normal_equations(batch, state, part)

@@ -102,3 +102,30 @@ def test_orthonormalize_turns_a_reflection_into_a_rotation() -> None:
     transform = np.diag([1.0, 1.0, -0.9, 1.0])
     rotation = se3.orthonormalize(transform)[:3, :3]
     np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-14)
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 10**6), angle=st.floats(0.0, 3.1), reach=st.sampled_from([0.0, 1e-3, 1.0, 100.0]))
+def test_relative_twist_and_inverse_jacobian_are_gtsams(seed: int, angle: float, reach: float) -> None:
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    twist = np.concatenate([angle * axis / np.linalg.norm(axis), rng.normal(scale=reach, size=3)])
+    back = se3.relative_twist(np.eye(4)[None], se3.se3_exp(twist[None]))[0]
+    np.testing.assert_allclose(back, twist, atol=1e-10 * (1.0 + reach))
+    np.testing.assert_allclose(back, gtsam.Pose3.Logmap(gtsam.Pose3.Expmap(twist)), atol=1e-9 * (1.0 + reach))
+    ours = se3.inverse_right_jacobian(twist[None])[0]
+    np.testing.assert_allclose(ours, gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(twist)), atol=1e-7 * (1 + reach))
+    # J_r^{-1} J_r = I with J_r by central differences of the exponential.
+    step, one = 1e-6, np.eye(4)[None]
+    ends = [se3.inverse(se3.se3_exp(twist)) @ se3.se3_exp(twist + s * step * np.eye(6)) for s in (1.0, -1.0)]
+    right = (se3.relative_twist(one, ends[0]) - se3.relative_twist(one, ends[1])) / (2 * step)
+    np.testing.assert_allclose(ours @ right.T, np.eye(6), atol=1e-6 * (1.0 + reach) ** 2)
+
+
+def test_relative_twist_is_exact_almost_up_to_a_half_turn(rng: np.random.Generator) -> None:
+    axis = rng.normal(size=(6, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    start = se3.se3_exp(rng.normal(size=(6, 6)))
+    for missing in (1e-2, 1e-4):
+        twist = np.concatenate([(np.pi - missing) * axis, rng.normal(size=(6, 3))], axis=1)
+        np.testing.assert_allclose(se3.relative_twist(start, se3.retract(start, twist)), twist, atol=1e-11 / missing)

@@ -19,8 +19,8 @@ import time
 from pathlib import Path
 
 from uni4d_fg.config.models import Config
+from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.sequence.model import Sequence
 
 
 def kill_at_write(count: int) -> None:

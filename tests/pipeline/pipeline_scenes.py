@@ -13,16 +13,16 @@ import numpy as np
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
-from uni4d_fg.evaluate.tum import read_tum
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.pipeline import RunSummary, reconstruct
-from uni4d_fg.reconstruction.depth_store import read_depth
-from uni4d_fg.reconstruction.io import load_reconstruction
-from uni4d_fg.reconstruction.labels_io import load_labels
-from uni4d_fg.reconstruction.model import Reconstruction
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import ArrayFrames, Sequence
-from uni4d_fg.synthetic import SyntheticSceneConfig, make_synthetic_sequence
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.evaluate.tum import read_tum
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.reconstruction import Reconstruction
 
 SMALL = {
     "num_frames": 8, "height": 96, "width": 128, "focal": 120.0, "margin_px": 3.0,

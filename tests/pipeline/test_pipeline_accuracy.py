@@ -19,16 +19,16 @@ from pipeline_scenes import (
     with_true_poses,
 )
 
-from uni4d_fg.evaluate.depth import DepthReport
-from uni4d_fg.evaluate.run import EvaluationReport, evaluate_run
-from uni4d_fg.evaluate.trajectory import TrajectoryMetrics
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.synthetic import CueNoise
 from uni4d_fg.geometry.camera import camera_to_world, unproject
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.reconstruction.labels_io import load_labels
-from uni4d_fg.reconstruction.model import Reconstruction
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.synthetic import CueNoise
+from uni4d_fg.results.evaluate.depth import DepthReport
+from uni4d_fg.results.evaluate.run import EvaluationReport, evaluate_run
+from uni4d_fg.results.evaluate.trajectory import TrajectoryMetrics
+from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.reconstruction import Reconstruction
 
 pytest.importorskip("open3d")
 

@@ -24,14 +24,14 @@ from pipeline_scenes import (
 )
 
 from uni4d_fg.errors import DegenerateProblemError, InputError
-from uni4d_fg.evaluate.run import evaluate_run
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
+from uni4d_fg.frontend.synthetic import CueNoise
+from uni4d_fg.frontend.track_model import TrackLabel, Tracks
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.reconstruction.depth_store import read_depth
-from uni4d_fg.reconstruction.labels_io import load_labels
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import ArrayFrames, Sequence
-from uni4d_fg.synthetic import CueNoise
-from uni4d_fg.tracks.model import TrackLabel, Tracks
+from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.evaluate.run import evaluate_run
+from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.run_folder import RunFolder
 
 pytest.importorskip("open3d")
 

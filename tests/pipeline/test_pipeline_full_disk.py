@@ -22,12 +22,12 @@ from pipeline_scenes import (
 )
 
 from uni4d_fg.errors import OutputError
+from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.reconstruction.clouds import read_ply
-from uni4d_fg.reconstruction.depth_store import read_depth
-from uni4d_fg.reconstruction.labels_io import load_labels
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
+from uni4d_fg.results.clouds import read_ply
+from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.run_folder import RunFolder
 
 pytest.importorskip("open3d")
 
@@ -89,11 +89,16 @@ def test_every_writer_fails_cleanly_and_the_run_goes_on_where_it_was(
     reconstruct(sequence, tmp_path, WITH_CLOUDS, resume=True)
     check_run(tmp_path, sequence)
     assert_same_result(tmp_path, complete)
-    stages = [f"{name}.npz" for name in ("tracks", "camera_init", "bundle_adjustment", "nonrigid")]
+    stages = [
+        "tracks.npz", "camera_init.graph.npz", "camera_init.npz", "bundle_adjustment.graph.npz",
+        "bundle_adjustment.npz", "nonrigid.graph.npz", "nonrigid.npz",
+    ]  # fmt: skip
+    kinds = ("bundle_adjustment", "camera_init", "nonrigid")
+    values = [f"{kind}.{end}.values" for kind in kinds for end in ("initial", "final")]
     views = ["static.ply", *(f"{t:05d}.ply" for t in range(4))]
     assert failed == [
         "config.yaml", "labels.npz", *stages, "depth.npy", "fusion.npz", "reconstruction.npz", "trajectory.tum",
-        *views, "summary.json",
+        *views, *values, "summary.json",
     ]  # fmt: skip
 
 

@@ -10,8 +10,8 @@ import pytest
 from pipeline_scenes import TINY, make_config, make_scene, run_sound, stop_at
 
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.sequence.model import Sequence
 
 pytest.importorskip("open3d")
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from pipeline_scenes import make_config, run_sound
 
-from uni4d_fg.evaluate.depth import DepthReport
-from uni4d_fg.evaluate.run import EvaluationReport, evaluate_run
+from uni4d_fg.frontend.sequence.model import ArrayFrames, FrameSource, GroundTruth, Sequence
+from uni4d_fg.frontend.sequence.read import read_sequence
 from uni4d_fg.pipeline import RunSummary
-from uni4d_fg.reconstruction.model import Reconstruction
-from uni4d_fg.sequence.model import ArrayFrames, FrameSource, GroundTruth, Sequence
-from uni4d_fg.sequence.read import read_sequence
+from uni4d_fg.results.evaluate.depth import DepthReport
+from uni4d_fg.results.evaluate.run import EvaluationReport, evaluate_run
+from uni4d_fg.slam.reconstruction import Reconstruction
 
 pytestmark = pytest.mark.data
 

@@ -26,9 +26,9 @@ from pipeline_scenes import (
 
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.pipeline import reconstruct
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
+from uni4d_fg.results.run_folder import RunFolder
 
 pytest.importorskip("open3d")
 
@@ -99,7 +99,7 @@ def test_without_resume_everything_is_computed_again(finished: Path, sequence: S
     [
         ("labels.band_static_px=4", "tracks"),
         ("camera_init.window=4", "camera_init"),
-        ("energy=unsquared", "camera_init"),
+        ("camera_init.kernel.kind=cauchy", "camera_init"),
         ("bundle_adjustment.depth_sigma=0.031", "bundle_adjustment"),
         ("nonrigid.arap_sigma_m=0.011", "nonrigid"),
         ("fusion.smoothing=5", "fusion"),

@@ -50,15 +50,15 @@ def compare(
     json: options.Json = False,
 ) -> None:
     """Compare Levenberg-Marquardt with the Adam baseline (needs the extra 'adam'), stage by stage."""
-    from uni4d_fg.compare.comparison import Comparison, Effort, compare_sequence
-    from uni4d_fg.compare.machine import machine
-    from uni4d_fg.compare.markdown import section
-    from uni4d_fg.compare.report import draw_comparison, write_report
-    from uni4d_fg.compare.solvers import entrants
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.pipeline.compare.comparison import Budget, Comparison, compare_sequence
+    from uni4d_fg.pipeline.compare.machine import machine
+    from uni4d_fg.pipeline.compare.markdown import section
+    from uni4d_fg.pipeline.compare.report import draw_comparison, write_report
+    from uni4d_fg.pipeline.compare.solvers import solver_variants
 
     described = machine()
-    solvers = entrants(variants or [])
+    solvers = solver_variants(variants or [])
     configs = {
         _name(preset): load_config(preset, [*_QUIET_OUTPUT, *(changes or ())])
         for preset in presets or ("default", "paper")
@@ -85,7 +85,7 @@ def compare(
                 folder = out / name / preset
                 try:
                     comparison = compare_sequence(
-                        sequence, preset, config, solvers, folder, Effort(repeats, budget), resume=resume,
+                        sequence, preset, config, solvers, folder, Budget(repeats, budget), resume=resume,
                         reporter=reporter, should_stop=stop,
                     )  # fmt: skip
                 except Cancelled as error:

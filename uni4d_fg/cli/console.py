@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from uni4d_fg.files import json_text
-from uni4d_fg.sequence.report import ItemSummary, ValidationReport
+from uni4d_fg.frontend.sequence.report import ItemSummary, ValidationReport
 
 STDERR = Console(stderr=True)
 

@@ -56,7 +56,7 @@ def cues(
 
     from uni4d_fg.config.load import load_config
     from uni4d_fg.cues.gather import gather_cues
-    from uni4d_fg.sequence.write import write_native, write_uni4d
+    from uni4d_fg.frontend.sequence.write import write_native, write_uni4d
 
     settings = load_config(config, changes or ())
     source = SequenceInput.of(

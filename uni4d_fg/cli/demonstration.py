@@ -7,15 +7,15 @@ from pathlib import Path
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import DEMO_SEQUENCE, SequenceInput, is_run, remove_results
 from uni4d_fg.cli.scenes import SCENE_FILE, reuse_or_write_scene
+from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.errors import OutputError
-from uni4d_fg.evaluate.points import PointMetrics
-from uni4d_fg.evaluate.run import EvaluationReport
+from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.pipeline import RunSummary
-from uni4d_fg.reconstruction.io import load_reconstruction
-from uni4d_fg.reconstruction.model import Reconstruction
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.synthetic.config import SyntheticSceneConfig
+from uni4d_fg.results.evaluate.points import PointMetrics
+from uni4d_fg.results.evaluate.run import EvaluationReport
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.reconstruction import Reconstruction
 
 DEMO_SCENE = SyntheticSceneConfig(num_frames=24, width=320, height=240)
 FAST_SCENE = SyntheticSceneConfig(num_frames=12, width=200, height=150, focal=188.0, grid_columns=24, grid_rows=18)

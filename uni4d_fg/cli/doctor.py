@@ -40,9 +40,9 @@ def doctor(
 
 def examine() -> dict[str, Any]:
     """Return everything that ``doctor`` says, as plain data."""
-    from uni4d_fg.solve.backend import choose_backend
-    from uni4d_fg.solve.extension import find_extension
-    from uni4d_fg.solve.threads import thread_count
+    from uni4d_fg.optim.backend import choose_backend
+    from uni4d_fg.optim.extension import find_extension
+    from uni4d_fg.optim.threads import thread_count
 
     core, reason = find_extension()
     backend = choose_backend("auto")

@@ -39,24 +39,24 @@ def export(
     depth: Annotated[bool, typer.Option("--depth", help="colmap, nerfstudio: dense depth too.")] = False,
     text: Annotated[bool, typer.Option(help="colmap: the model as text too.")] = True,
     trajectories: Annotated[bool, typer.Option("--trajectories", help="ply: trajectories, camera path too.")] = False,
-    tail: Annotated[int, typer.Option(help="rrd: past frames that a trajectory shows.", min=1)] = 10,
+    trail: Annotated[int, typer.Option(help="rrd: past frames that a trajectory shows.", min=1)] = 10,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
     json: options.Json = False,
 ) -> None:
     """Write a run in the formats of other programs."""
-    from uni4d_fg.export import ExportOptions, export_run
-    from uni4d_fg.export.source import RunSource
-    from uni4d_fg.sequence.model import Sequence
+    from uni4d_fg.frontend.sequence.model import Sequence
+    from uni4d_fg.results.export import ExportOptions, export_run
+    from uni4d_fg.results.run import Run
 
     def open_sequence() -> Sequence:
         stored = stored_input(run)
         return (stored if sequence is None else replace(stored, root=str(sequence.resolve()))).read()
 
-    choices = ExportOptions(masks=masks, depth=depth, text=text, trajectories=trajectories, tail=tail)
+    choices = ExportOptions(masks=masks, depth=depth, text=text, trajectories=trajectories, trail=trail)
     with progress_reporter(quiet or json) as reporter, Interruption() as stop:
         reports = export_run(
-            RunSource(run, open_sequence), [choice.value for choice in to], out, choices,
+            Run(run, open_sequence), [choice.value for choice in to], out, choices,
             overwrite=overwrite, reporter=reporter, should_stop=stop,
         )  # fmt: skip
     if json:

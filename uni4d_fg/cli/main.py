@@ -9,7 +9,18 @@ from typing import Annotated
 
 import typer
 
-from uni4d_fg.cli import comparison, cues, doctor, exports, reconstruction, results, sequences, streaming, viewing
+from uni4d_fg.cli import (
+    comparison,
+    cues,
+    doctor,
+    exports,
+    graphs,
+    reconstruction,
+    results,
+    sequences,
+    streaming,
+    viewing,
+)
 from uni4d_fg.cli.console import log_to_stderr, one_line, print_error
 from uni4d_fg.errors import Cancelled, Uni4dFgError
 
@@ -25,7 +36,7 @@ app = typer.Typer(
 for verb in (
     reconstruction.demo, doctor.doctor, sequences.validate, sequences.track, cues.cues, reconstruction.reconstruct,
     streaming.stream,
-    results.evaluate, exports.export, viewing.view, viewing.report,
+    results.evaluate, exports.export, graphs.graph, viewing.view, viewing.report,
     comparison.compare, sequences.synthesize, results.config,
 ):  # fmt: skip
     app.command()(verb)

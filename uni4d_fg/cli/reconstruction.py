@@ -19,8 +19,8 @@ from uni4d_fg.errors import Cancelled, ConfigError
 if TYPE_CHECKING:
     from uni4d_fg.config.models import Config
     from uni4d_fg.cues.plan import CuePlan, CueReport
+    from uni4d_fg.frontend.sequence.model import Sequence, Video
     from uni4d_fg.pipeline import RunSummary
-    from uni4d_fg.sequence.model import Sequence, Video
 
 
 def reconstruct(
@@ -95,7 +95,7 @@ def demo(
     """Make a moving scene, reconstruct it, and score the result against the exact truth."""
     from uni4d_fg.cli import demonstration
     from uni4d_fg.config.load import load_config
-    from uni4d_fg.evaluate.run import evaluate_run
+    from uni4d_fg.results.evaluate.run import evaluate_run
 
     settings = load_config(config or ("fast" if fast else None), changes or ())
     demonstration.prepare_demo_folder(out, resume=resume)
@@ -119,7 +119,7 @@ def run_cues(
         Uni4dFgError: As :func:`~uni4d_fg.cues.gather.gather_cues`.
     """
     from uni4d_fg.cues.gather import gather_cues
-    from uni4d_fg.sequence.assemble import as_sequence
+    from uni4d_fg.frontend.sequence.assemble import as_sequence
 
     if plan.is_given:
         return as_sequence(replace(video, masks=None) if plan.masks == "none" else video), None

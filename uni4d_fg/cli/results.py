@@ -23,8 +23,8 @@ def evaluate(
     json: options.Json = False,
 ) -> None:
     """Score a run against the ground truth of its sequence."""
-    from uni4d_fg.evaluate.run import evaluate_run
-    from uni4d_fg.evaluate.table import format_report
+    from uni4d_fg.results.evaluate.run import evaluate_run
+    from uni4d_fg.results.evaluate.table import format_report
 
     source = stored_input(run)
     if sequence is not None:
@@ -42,8 +42,11 @@ def config(
     config: options.ConfigChoice = None,
     preset: Annotated[str | None, typer.Option(help="The same as --config.", show_default=False)] = None,
     changes: options.Overrides = None,
+    everything: Annotated[bool, typer.Option("--all", help="Print every field, advanced ones too.")] = False,
 ) -> None:
-    """Print every field of a configuration, as it would be used."""
+    """Print a configuration as it would be used: the basic fields, and the others where they are not at the default."""
     from uni4d_fg.config.load import dump_config, load_config
+    from uni4d_fg.config.written import basic_fields, commented_yaml
 
-    typer.echo(dump_config(load_config(config or preset, changes or ())), nl=False)
+    chosen = load_config(config or preset, changes or ())
+    typer.echo(dump_config(chosen) if everything else commented_yaml(basic_fields(chosen)), nl=False)

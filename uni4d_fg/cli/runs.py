@@ -13,13 +13,13 @@ from uni4d_fg.cues.manifest import MANIFEST, has_manifest, load_cues
 from uni4d_fg.cues.plan import CueFiles, CuePlan, plan_cues
 from uni4d_fg.errors import ConfigError, InputError, OutputError
 from uni4d_fg.files import atomic_write_json, write_failure
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.assemble import as_sequence
-from uni4d_fg.sequence.layout import Layout, LayoutOptions
-from uni4d_fg.sequence.model import Sequence, Video
-from uni4d_fg.sequence.open_video import open_video
-from uni4d_fg.sequence.read import detect_layout, read_sequence
-from uni4d_fg.sequence.selection import FrameSelection, select_frames
+from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.layout import Layout, LayoutOptions
+from uni4d_fg.frontend.sequence.model import Sequence, Video
+from uni4d_fg.frontend.sequence.open_video import open_video
+from uni4d_fg.frontend.sequence.read import detect_layout, read_sequence
+from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
+from uni4d_fg.results.run_folder import RunFolder
 
 STORED_INPUT = "input.json"
 DEMO_SEQUENCE = "sequence"
@@ -245,7 +245,13 @@ def remove_results(folder: Path) -> None:
     try:
         for path in files:
             path.unlink(missing_ok=True)
-        for path in (run.static_cloud.parent, run.trajectory_picture.parent, folder / "stages", run.exports):
+        for path in (
+            run.static_cloud.parent,
+            run.trajectory_picture.parent,
+            folder / "stages",
+            run.graphs,
+            run.exports,
+        ):
             if path.is_dir():
                 shutil.rmtree(path)
     except OSError as error:

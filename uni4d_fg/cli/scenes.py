@@ -10,11 +10,11 @@ from typing import Any
 import yaml
 
 from uni4d_fg.config.load import dump_config, with_overrides
+from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.errors import OutputError
 from uni4d_fg.files import atomic_write_text
-from uni4d_fg.sequence.model import Sequence as VideoSequence
-from uni4d_fg.sequence.write import write_native, write_uni4d
-from uni4d_fg.synthetic.config import SyntheticSceneConfig
+from uni4d_fg.frontend.sequence.model import Sequence as VideoSequence
+from uni4d_fg.frontend.sequence.write import write_native, write_uni4d
 
 SCENE_FILE = "scene.yaml"
 
@@ -36,7 +36,7 @@ def write_scene(scene: SyntheticSceneConfig, folder: Path, layout: str = "native
         OutputError: If the folder is in the way or cannot be written.
         MissingDependencyError: If Open3D cannot be loaded.
     """
-    from uni4d_fg.synthetic.simulate import make_synthetic_sequence
+    from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
 
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise OutputError(f"cannot write {folder}: it exists already; remove it or choose another folder")

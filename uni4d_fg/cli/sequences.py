@@ -17,7 +17,7 @@ from uni4d_fg.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from uni4d_fg.arrays import ImageArray
-    from uni4d_fg.sequence.model import FrameSource
+    from uni4d_fg.frontend.sequence.model import FrameSource
 
 
 def validate(
@@ -31,7 +31,7 @@ def validate(
     json: options.Json = False,
 ) -> None:
     """Check a sequence: what is there, what is wrong, what to do. Exit code 3 if it cannot be used."""
-    from uni4d_fg.sequence.validate import validate_sequence
+    from uni4d_fg.frontend.sequence.validate import validate_sequence
 
     source = SequenceInput.of(
         seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics
@@ -55,8 +55,8 @@ def track(
 ) -> None:
     """Track points through a video with the built-in tracker and write them to a file."""
     from uni4d_fg.config.load import load_config
-    from uni4d_fg.tracks.io import save_tracks
-    from uni4d_fg.tracks.lucas_kanade import track_grid
+    from uni4d_fg.frontend.tracks.io import save_tracks
+    from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
 
     settings = load_config(config, changes or ()).tracking
     images, path = images_and_track_file(seq, out, overwrite)
@@ -76,10 +76,10 @@ def images_and_track_file(seq: Path, out: Path | None, overwrite: bool) -> tuple
         InputError: If there are no images, or there is no place for the tracks and ``out`` is not given.
         OutputError: If the file exists and is not to be replaced.
     """
-    from uni4d_fg.sequence.assemble import open_images
-    from uni4d_fg.sequence.layout import find_images
-    from uni4d_fg.sequence.open_video import open_video
-    from uni4d_fg.sequence.uni4d_layout import is_uni4d_layout
+    from uni4d_fg.frontend.sequence.assemble import open_images
+    from uni4d_fg.frontend.sequence.layout import find_images
+    from uni4d_fg.frontend.sequence.open_video import open_video
+    from uni4d_fg.frontend.sequence.uni4d_layout import is_uni4d_layout
 
     own = find_images(seq) if seq.is_dir() else None
     # The other cues of a sequence folder may be missing or broken: tracks need images only.
@@ -104,7 +104,7 @@ def synthesize(
     layout: options.Layout = LayoutChoice.native,
     quiet: options.Quiet = False,
 ) -> None:
-    """Make a moving scene with exact ground truth. All fields of --set are in docs/configuration.md."""
+    """Make a moving scene with exact ground truth. All fields of --set are in docs/configuration_advanced.md."""
     from uni4d_fg.cli.scenes import scene_config, write_scene
 
     named = {"num_frames": frames, "width": width, "height": height, "path": path, "objects": objects, "seed": seed}

@@ -18,8 +18,8 @@ from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
 
 if TYPE_CHECKING:
-    from uni4d_fg.incremental.model import FrameUpdate
     from uni4d_fg.progress import Reporter
+    from uni4d_fg.slam.incremental.model import FrameUpdate
 
 
 def stream(
@@ -47,7 +47,7 @@ def stream(
 ) -> None:
     """Reconstruct frame by frame over a sliding window: cameras, static and moving points of a video of any length."""
     from uni4d_fg.config.load import load_config
-    from uni4d_fg.incremental.stream import stream_sequence
+    from uni4d_fg.pipeline.stream import stream_sequence
 
     settings = load_config(config, changes or ())
     if masks == "motion":

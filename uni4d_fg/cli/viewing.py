@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uni4d_fg.cli import options
-from uni4d_fg.reconstruction.run_folder import RunFolder
+from uni4d_fg.results.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from uni4d_fg.view.opened_run import OpenedRun
+    from uni4d_fg.results.run import Run
 
 
 def view(
@@ -24,9 +24,9 @@ def view(
     max_points: Annotated[int, typer.Option(help="Points of the static cloud that are sent.", min=1)] = 400_000,
 ) -> None:
     """Show a run in a browser: cameras, clouds and trajectories over time."""
-    from uni4d_fg.view.content import Limits
-    from uni4d_fg.view.server import viewer_server
-    from uni4d_fg.view.viewer import Viewer
+    from uni4d_fg.results.view.content import Limits
+    from uni4d_fg.results.view.server import viewer_server
+    from uni4d_fg.results.view.viewer import Viewer
 
     # Ctrl-C is how a viewer is closed, so that it is no failure; a shell's background job is started deaf to it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -47,15 +47,15 @@ def report(
     ] = None,
 ) -> None:
     """Write one self-contained HTML page about a run: what was done, how well, and what to distrust."""
-    from uni4d_fg.report.build import write_report
+    from uni4d_fg.results.report.build import write_report
 
     path = out or RunFolder(run).report
     write_report(_open(run), path)
     typer.echo(f"report: {path}")
 
 
-def _open(run: Path) -> OpenedRun:
+def _open(run: Path) -> Run:
     from uni4d_fg.cli.runs import stored_input
-    from uni4d_fg.view.opened_run import open_run
+    from uni4d_fg.results.run import Run
 
-    return open_run(run, lambda: stored_input(run).read())
+    return Run(run, lambda: stored_input(run).read())

@@ -1,4 +1,4 @@
-"""Typed configuration: pydantic models, YAML presets, command-line overrides."""
+"""Typed configuration: pydantic models of runs and synthetic scenes, YAML presets, command-line overrides."""
 
 from uni4d_fg.config.models import Config
 

@@ -35,13 +35,15 @@ def build_section(
         ConfigError: With every problem found (at most five): source, dotted path, value given, values allowed.
     """
     problems = list(_not_plain(values, ()))
-    if not problems:
+    plain = not problems
+    if plain:
         try:
             # JSON is strict about types but lets a list become a tuple.
             return model.model_validate_json(json.dumps(values), strict=True)
         except ValidationError as error:
             problems = [_problem(model, detail) for detail in error.errors(include_url=False)]
-    texts = [f"{source_of(path)}: {text}" for path, text in problems[:_MAX_LISTED]]
+    # Fields that contradict each other may come from several sources.
+    texts = [text if plain and not path else f"{source_of(path)}: {text}" for path, text in problems[:_MAX_LISTED]]
     if len(problems) > _MAX_LISTED:
         texts.append(f"and {len(problems) - _MAX_LISTED} more")
     raise ConfigError("; ".join(texts))
@@ -89,7 +91,7 @@ def _problem(model: type[Section], detail: Any) -> tuple[tuple[str, ...], str]:
         return names, unknown_field(model, names)
     field = find_field(model, names)
     if field is None or detail["type"] == "value_error":
-        return names, f"{'.'.join(names) or 'values'}: {detail['msg'].removeprefix('Value error, ')}"
+        return names, ": ".join([*([".".join(names)] if names else []), detail["msg"].removeprefix("Value error, ")])
     if detail["type"] == "missing":
         return names, f"{'.'.join(names)}: is missing, but {allowed_values(field)} is expected"
     entry = " in the list" if any(isinstance(part, int) for part in detail["loc"]) else ""

@@ -10,14 +10,15 @@ from uni4d_fg.config.base import Section, setting
 class TrackingConfig(Section):
     """Built-in tracker (pyramidal Lucas-Kanade on a grid), used when a sequence brings no tracks."""
 
-    grid_columns: int = setting(50, "Query points per row of the grid.", ge=2, le=400)
-    grid_rows: int = setting(50, "Query points per column of the grid.", ge=2, le=400)
-    query_interval: int = setting(10, "A new grid is started every this many frames.", ge=1)
+    grid_columns: int = setting(50, "Query points per row of the grid.", ge=2, le=400, basic=True)
+    grid_rows: int = setting(50, "Query points per column of the grid.", ge=2, le=400, basic=True)
+    query_interval: int = setting(10, "A new grid is started every this many frames.", ge=1, basic=True)
     reseed_spacing: float | None = setting(
         1.25,
         "Side of the cells, in spacings of the grid, in which a point is started in any frame between two grids that "
         "leaves them without a live one; null: points start on the grids only.",
         ge=1,
+        basic=True,
     )
     reseed_quality: float = setting(
         0.03, "Texture that such a point needs, as a fraction of the best in the image.", ge=0, lt=1
@@ -27,7 +28,7 @@ class TrackingConfig(Section):
     pyramid_levels: int = setting(3, "Pyramid levels above the full image.", ge=0, le=8)
     max_iterations: int = setting(30, "Lucas-Kanade iterations per level.", ge=1)
     convergence_px: float = setting(0.01, "Lucas-Kanade stops when a point moves less than this, px.", gt=0)
-    forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0)
+    forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0, basic=True)
     max_drift_px: float | None = setting(
         None,
         "Largest distance between a point and where its first appearance is found, px; null: not checked. The check "
@@ -43,16 +44,20 @@ class TrackingConfig(Section):
 class LabelConfig(Section):
     """Static / dynamic / rejected labels from the masks, with an uncertain band around object borders."""
 
-    band_static_px: int = setting(5, "Width of the band on the static side of a mask border, px.", ge=0, le=100)
-    band_dynamic_px: int = setting(3, "Width of the band on the object's side of a mask border, px.", ge=0, le=100)
+    band_static_px: int = setting(
+        5, "Width of the band on the static side of a mask border, px.", ge=0, le=100, basic=True
+    )
+    band_dynamic_px: int = setting(
+        3, "Width of the band on the object's side of a mask border, px.", ge=0, le=100, basic=True
+    )
     band_weight: float = setting(
         0.0, "Weight of a kept track's observations inside the band; 0 drops them.", ge=0, le=1
     )
     min_static_frames: int = setting(
-        5, "A static track must be surely seen in this many frames to carry a camera ...", ge=1
+        5, "A static track must be surely seen in this many frames to carry a camera.", ge=1, basic=True
     )
     min_static_fraction: float = setting(
-        0.5, "... or in this fraction of the frames where that is fewer (a short video).", ge=0, le=1
+        0.5, "The same as a fraction of the frames, taken where that is fewer (a short video).", ge=0, le=1
     )
     max_off_label_fraction: float = setting(
         0.0, "Share of a track's sure observations that may disagree with its label (they are dropped).",
@@ -67,11 +72,12 @@ class InputConfig(Section):
     """What of the sequence is taken as known."""
 
     intrinsics: Literal["free", "fixed"] = setting(
-        "free", "'free': the sequence's intrinsics are a starting value; 'fixed': they are kept."
+        "free", "'free': the sequence's intrinsics are a starting value; 'fixed': they are kept.", basic=True
     )
     poses: Literal["estimate", "initial", "fixed"] = setting(
         "estimate",
         "'estimate': ignore given poses; 'initial': start stage 2 from them; 'fixed': keep them.",
+        basic=True,
     )
-    min_depth_m: float = setting(0.05, "Depth below this is treated as missing, m.", ge=0)
-    max_depth_m: float = setting(80.0, "Depth above this is treated as missing, m.", gt=0)
+    min_depth_m: float = setting(0.05, "Depth below this is treated as missing, m.", ge=0, basic=True)
+    max_depth_m: float = setting(80.0, "Depth above this is treated as missing, m.", gt=0, basic=True)

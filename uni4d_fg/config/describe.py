@@ -9,7 +9,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from uni4d_fg.config.base import Section
+from uni4d_fg.config.base import Section, is_basic
 
 _TYPE_TEXT = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
 _BOUND_TEXT = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
@@ -25,6 +25,8 @@ class FieldDescription:
     """Type and bounds in words."""
     default: Any
     description: str
+    basic: bool = True
+    """Whether it is one that a user turns; the other fields are the method's own numbers."""
 
 
 def section_type(field: FieldInfo) -> type[Section] | None:
@@ -74,14 +76,20 @@ def _annotation_text(annotation: Any) -> tuple[str, bool]:
     return _TYPE_TEXT.get(annotation, str(annotation)), False
 
 
-def describe_fields(model: Section, prefix: str = "") -> Iterator[FieldDescription]:
-    """Yield every field of a section and of the sections in it, with its value in ``model`` as default."""
+def describe_fields(model: Section, prefix: str = "", *, basic: bool = True) -> Iterator[FieldDescription]:
+    """Yield every field of a section and of the sections in it, with its value in ``model`` as default.
+
+    Args:
+        model: The section.
+        prefix: Put before every path.
+        basic: Whether the section itself is one that a user turns.
+    """
     for name, field in type(model).model_fields.items():
-        value = getattr(model, name)
+        value, kind = getattr(model, name), basic and is_basic(field)
         if isinstance(value, Section):
-            yield from describe_fields(value, f"{prefix}{name}.")
+            yield from describe_fields(value, f"{prefix}{name}.", basic=kind)
         else:
-            yield FieldDescription(f"{prefix}{name}", allowed_values(field), value, field.description or "")
+            yield FieldDescription(f"{prefix}{name}", allowed_values(field), value, field.description or "", kind)
 
 
 def field_paths(model: type[Section], prefix: str = "") -> Iterator[str]:

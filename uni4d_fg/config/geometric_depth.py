@@ -9,7 +9,10 @@ class GeometricDepthConfig(Section):
     """Up-to-scale structure from motion, and depth maps interpolated from it."""
 
     median_depth: float = setting(
-        2.0, "The median depth of the first frame's points is made this long: the unit of the whole result.", gt=0
+        2.0,
+        "The median depth of the first frame's points is made this long: the unit of the whole result.",
+        gt=0,
+        basic=True,
     )
     max_tracks: int = setting(
         3000, "Tracks used to find the cameras, spread over frames and image; all are triangulated afterwards.", ge=50
@@ -59,6 +62,25 @@ class GeometricDepthConfig(Section):
     moving_depth_sigma: float = setting(
         0.15, "Standard deviation of the log depth of moving things, known only from where they stand.", gt=0
     )
+    sampled_frames: int = setting(20, "The two frames to start from are among this many, evenly spaced.", ge=2)
+    fitted_tracks: int = setting(250, "Tracks of a pair of frames on which its parallax is measured, at most.", ge=8)
+    enough_tracks: int = setting(300, "More common tracks than this make a pair of frames no better.", ge=8)
+    tried_pairs: int = setting(4, "Pairs of frames to start from that are tried, the best first.", ge=1)
+    trial_frames: int = setting(8, "Frames from one of the pair to the other that such a trial poses.", ge=2)
+    two_view_trials: int = setting(5000, "Trials of the robust essential matrix of two frames, at most.", ge=1)
+    resection_trials: int = setting(500, "RANSAC trials of a frame's pose from the points it sees.", ge=1)
+    focal_min_frames: int = setting(
+        3, "The focal lengths are free from this many posed frames on: two do not determine them robustly.", ge=2
+    )
+    triangulation_huber_px: float = setting(1.0, "Threshold of Huber's kernel in triangulation, px.", gt=0)
+    support_neighbours: int = setting(
+        8, "A point is interpolated only if it is like some of this many nearest points of the frame: ...", ge=1
+    )
+    min_supporters: int = setting(2, "... at least this many, ...", ge=0)
+    support_ratio: float = setting(1.25, "... whose depth differs from its own by less than this factor.", gt=1)
+    min_interpolated_points: int = setting(
+        3, "A frame with fewer points takes those of the nearest frame that has enough.", ge=1
+    )
 
 
 class AffineDepthConfig(Section):
@@ -74,3 +96,7 @@ class AffineDepthConfig(Section):
     max_depth_ratio: float = setting(
         10.0, "Depth beyond this many times the frame's median is cut there, so that none is negative.", gt=1
     )
+    probe_quantiles: tuple[float, ...] = setting(
+        (0.1, 0.5, 0.9), "Quantiles of the network's values at which that change is measured.", min_length=1
+    )
+    min_sigma: float = setting(1e-3, "Floor of the measured noise, as a part of the median inverse depth.", gt=0)

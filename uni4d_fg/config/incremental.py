@@ -9,16 +9,19 @@ from uni4d_fg.config.solver import SolverConfig
 class IncrementalConfig(Section):
     """Windowed solving of a video of any length. Terms, kernels and sigmas are those of stages 2 and 3."""
 
-    window: int = setting(12, "Keyframes in the window; the oldest is marginalised when it is full.", ge=3, le=200)
+    window: int = setting(
+        12, "Keyframes in the window; the oldest is marginalized when it is full.", ge=3, le=200, basic=True
+    )
     keyframe_parallax: float = setting(
         0.012,
         "A frame becomes a keyframe when its tracks have moved by this part of the longer image side since the last "
-        "one (median); 0 makes every frame one ...",
+        "one (median); 0 makes every frame one.",
         ge=0,
         le=1,
+        basic=True,
     )
     keyframe_overlap: float = setting(
-        0.6, "... or when fewer than this part of the last keyframe's tracks are left ...", ge=0, le=1
+        0.6, "It also becomes one when fewer than this part of the last keyframe's tracks are left ...", ge=0, le=1
     )
     keyframe_interval: int = setting(30, "... or after this many frames in any case.", ge=1)
     min_tracks: int = setting(
@@ -53,12 +56,17 @@ class IncrementalConfig(Section):
         10, "Frames over which moving points are solved together; at least nonrigid_lag + 2.", ge=3, le=200
     )
     nonrigid_lag: int = setting(
-        5, "A moving point is handed over once this many later frames have been seen; less than window.", ge=0
+        5,
+        "A moving point is handed over once this many later frames have been seen; less than window.",
+        ge=0,
+        basic=True,
     )
     nonrigid_solver: SolverConfig = setting(
         SolverConfig(max_iterations=6, relative_decrease=1e-3), "Solver of the window of moving points."
     )
-    max_live_tracks: int = setting(3000, "Largest number of points that the built-in tracker follows.", ge=50)
+    max_live_tracks: int = setting(
+        3000, "Largest number of points that the built-in tracker follows.", ge=50, basic=True
+    )
     checkpoint_interval: int = setting(
         20,
         "The state is written to disk every this many frames ('uni4d-fg stream'); resuming goes on from there.",

@@ -70,7 +70,7 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
 
     Raises:
         ConfigError: If there is no such preset or file, it is not YAML, or a field is unknown, of the wrong
-            type or out of bounds.
+            type or out of bounds, or fields contradict each other.
     """
     layers: list[tuple[str, dict[str, Any]]] = []
     if preset_or_file is not None and _is_file_name(preset_or_file):

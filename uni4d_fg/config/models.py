@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
+
+from pydantic import model_validator
 
 from uni4d_fg.config.adam import AdamConfig
 from uni4d_fg.config.base import Section, setting
@@ -11,6 +14,7 @@ from uni4d_fg.config.geometric_depth import AffineDepthConfig, GeometricDepthCon
 from uni4d_fg.config.incremental import IncrementalConfig
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
+from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
 from uni4d_fg.config.windows import WindowsConfig
 
@@ -18,8 +22,8 @@ from uni4d_fg.config.windows import WindowsConfig
 class OutputConfig(Section):
     """What a run writes besides the reconstruction and its summary."""
 
-    clouds: bool = setting(True, "Write the static and per-frame dynamic PLY files.")
-    pictures: bool = setting(True, "Write the trajectory plot, the depth strip and the rendered views.")
+    clouds: bool = setting(True, "Write the static and per-frame dynamic PLY files.", basic=True)
+    pictures: bool = setting(True, "Write the trajectory plot, the depth strip and the rendered views.", basic=True)
 
 
 class Config(Section):
@@ -30,33 +34,81 @@ class Config(Section):
         "Weights of the exact energy and of 'paper' solves. 'mean': per-frame means, then the mean over frames "
         "(the reference program); 'sum': plain sums (the paper's text).",
     )
-    energy: Literal["map", "unsquared"] = setting(
+    energy: Literal["map", "paper"] = setting(
         "map",
-        "'map': squared, robust terms with calibrated sigmas; 'unsquared': the paper's norms and weights, "
+        "'map': squared, robust terms with calibrated sigmas; 'paper': the paper's unsquared norms and weights, "
         "smoothed and annealed.",
+        basic=True,
     )
     solver: Literal["lm", "adam"] = setting(
         "lm",
         "Minimiser of every stage: 'lm' is Levenberg-Marquardt; 'adam' is the first-order baseline, which needs "
         "PyTorch and is made for the preset 'paper'.",
+        basic=True,
     )
     backend: Literal["auto", "cpp", "python", "gtsam"] = setting(
         "auto",
         "Implementation of 'lm': 'cpp' is the extension in cpp_factors/, 'python' is NumPy, 'auto' the first of "
         "these that is installed; 'gtsam' is a GTSAM factor graph, slow, for comparison.",
+        basic=True,
     )
-    input: InputConfig = setting(InputConfig(), "Use of what the sequence brings.")
-    tracking: TrackingConfig = setting(TrackingConfig(), "Built-in tracker.")
-    labels: LabelConfig = setting(LabelConfig(), "Track labels.")
-    camera_init: CameraInitConfig = setting(CameraInitConfig(), "Stage 1.")
-    bundle_adjustment: BundleAdjustmentConfig = setting(BundleAdjustmentConfig(), "Stage 2.")
-    nonrigid: NonRigidConfig = setting(NonRigidConfig(), "Stage 3.")
+    input: InputConfig = setting(InputConfig(), "Use of what the sequence brings.", basic=True)
+    tracking: TrackingConfig = setting(TrackingConfig(), "Built-in tracker.", basic=True)
+    labels: LabelConfig = setting(LabelConfig(), "Track labels.", basic=True)
+    camera_init: CameraInitConfig = setting(CameraInitConfig(), "Stage 1.", basic=True)
+    bundle_adjustment: BundleAdjustmentConfig = setting(BundleAdjustmentConfig(), "Stage 2.", basic=True)
+    nonrigid: NonRigidConfig = setting(NonRigidConfig(), "Stage 3.", basic=True)
+    rigid_objects: RigidObjectsConfig = setting(
+        RigidObjectsConfig(), "Search for moving instances that are rigid bodies, and their poses.", basic=True
+    )
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
-    windows: WindowsConfig = setting(WindowsConfig(), "Reconstruction in windows.")
-    incremental: IncrementalConfig = setting(IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.")
-    fusion: FusionConfig = setting(FusionConfig(), "Fusion.")
-    networks: NetworkConfig = setting(NetworkConfig(), "Networks that make cues.")
-    geometric_depth: GeometricDepthConfig = setting(GeometricDepthConfig(), "Depth from camera motion alone.")
+    windows: WindowsConfig = setting(WindowsConfig(), "Reconstruction in windows.", basic=True)
+    incremental: IncrementalConfig = setting(
+        IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.", basic=True
+    )
+    fusion: FusionConfig = setting(FusionConfig(), "Fusion.", basic=True)
+    networks: NetworkConfig = setting(NetworkConfig(), "Networks that make cues.", basic=True)
+    geometric_depth: GeometricDepthConfig = setting(
+        GeometricDepthConfig(), "Depth from camera motion alone.", basic=True
+    )
     affine_depth: AffineDepthConfig = setting(AffineDepthConfig(), "Scale and shift of relative depth networks.")
-    motion_masks: MotionMaskConfig = setting(MotionMaskConfig(), "Masks from motion alone, and instances over time.")
-    output: OutputConfig = setting(OutputConfig(), "Output.")
+    motion_masks: MotionMaskConfig = setting(
+        MotionMaskConfig(), "Masks from motion alone, and instances over time.", basic=True
+    )
+    output: OutputConfig = setting(OutputConfig(), "Output.", basic=True)
+
+    @model_validator(mode="after")
+    def _energy_is_whole(self) -> Config:
+        """Refuse a mixture of the two energies: kernels, depth priors and noise belong together."""
+        found = list(self._contradictions())
+        if found:
+            raise ValueError(
+                f"energy '{self.energy}' contradicts {', '.join(found)}; '--config paper' takes the whole of energy "
+                "'paper', the other presets that of 'map'"
+            )
+        return self
+
+    def _contradictions(self) -> Iterator[str]:
+        paper = self.energy == "paper"
+        adjustment, moving = self.bundle_adjustment, self.nonrigid
+        kernels = {
+            "camera_init.kernel": self.camera_init.kernel,
+            "bundle_adjustment.reprojection_kernel": adjustment.reprojection_kernel,
+            "nonrigid.reprojection_kernel": moving.reprojection_kernel,
+            "nonrigid.smoothness_kernel": moving.smoothness_kernel,
+            "nonrigid.arap_kernel": moving.arap_kernel,
+        }
+        if not paper:  # Energy 'paper' has no depth priors, whatever their kernels.
+            kernels["bundle_adjustment.depth_kernel"] = adjustment.depth_kernel
+            kernels["nonrigid.depth_kernel"] = moving.depth_kernel
+        for path, kernel in kernels.items():
+            if (kernel.kind == "norm") != paper:
+                yield f"{path}.kind={kernel.kind}"
+        switches = {
+            "bundle_adjustment.measure_noise": adjustment.measure_noise,
+            "bundle_adjustment.depth_prior": adjustment.depth_prior,
+            "nonrigid.depth_prior": moving.depth_prior,
+        }
+        for path, on in switches.items():
+            if paper and on:
+                yield f"{path}=true"

@@ -13,9 +13,17 @@ class InstanceConfig(Section):
     )
     max_missed_frames: int = setting(5, "An instance that is not found keeps its number for this many frames ...", ge=0)
     drawn_missed_frames: int = setting(2, "... and is drawn, moved on by its velocity, in the first of them.", ge=0)
+    hidden_overlap_weight: float = setting(
+        0.5,
+        "Weight of the share of a detection that lies within an instance missed before, where that exceeds "
+        "their intersection over union: what comes out from behind something is at first only partly seen.",
+        ge=0,
+        le=1,
+    )
     join_parts: bool = setting(
         False, "A further detection within an instance is a part of it: for regions, which break where hidden."
     )
+    min_part_overlap: float = setting(0.5, "Least share of a part that lies within its instance.", gt=0, le=1)
     min_score: float = setting(0.3, "Detections below this score are dropped.", ge=0, le=1)
     min_area_px: int = setting(64, "Detections smaller than this are dropped, px.", ge=1)
     same_class: bool = setting(False, "Only detections of an instance's own class continue it.")
@@ -51,9 +59,14 @@ class MotionMaskConfig(Section):
         (2, 5, 10, 20), "A track is tested between frames this far apart.", min_length=1
     )
     moving_sigmas: float = setting(
-        5.0, "A track moves if it departs from the static scene by more standard deviations than this ...", gt=0
+        5.0,
+        "A track moves if it departs from the static scene by more standard deviations than this.",
+        gt=0,
+        basic=True,
     )
-    static_sigmas: float = setting(3.0, "... and is static below this; between them it does not say.", gt=0)
+    static_sigmas: float = setting(
+        3.0, "It is static below this; between this and moving_sigmas it does not say.", gt=0
+    )
     track_quantile: float = setting(
         0.8, "Quantile of a track's departures over its frame pairs that is compared with both.", gt=0, le=1
     )
@@ -67,11 +80,46 @@ class MotionMaskConfig(Section):
     neighbour_frames_weight: float = setting(
         0.5, "Weight of the evidence of the frames before and after, warped by flow.", ge=0
     )  # fmt: skip
-    threshold: float = setting(1.0, "Log odds above which a pixel moves.")
+    threshold: float = setting(1.0, "Log odds above which a pixel moves.", basic=True)
     min_area_fraction: float = setting(0.002, "Regions smaller than this part of the image are dropped.", ge=0, lt=1)
     max_static_fraction: float = setting(
         0.5, "Regions in which more than this share of the decided tracks is static are dropped.", ge=0, le=1
     )
     min_frames: int = setting(5, "Instances that move in fewer frames than this are dropped.", ge=1)
-    grow_px: int = setting(2, "Masks are grown by this at the end, px.", ge=0)
+    grow_px: int = setting(2, "Masks are grown by this at the end, px.", ge=0, basic=True)
     instances: InstanceConfig = setting(InstanceConfig(join_parts=True), "How regions are joined to instances.")
+    camera_rounds: int = setting(
+        2,
+        "Cameras are solved and tracks tested this often, each time without the tracks that were found to move.",
+        ge=1,
+    )
+    first_guess_min_tracks: int = setting(12, "Frames that share fewer tracks take no part in the first guess.", ge=4)
+    first_guess_max_tracks: int = setting(600, "Tracks from which the pose of the first guess is found, at most.", ge=4)
+    first_guess_trials: int = setting(200, "RANSAC trials of the first guess.", ge=1)
+    depthless_sigma: float = setting(1.5, "Standard deviation of log depth where a track has no depth.", gt=0)
+    shared_min_tracks: int = setting(
+        30,
+        "What the tracks of a pair of frames share (an error of its cameras) is fitted to at least this many ...",
+        ge=6,
+    )
+    shared_max_tracks: int = setting(800, "... and at most this many tracks.", ge=6)
+    shared_prior: float = setting(
+        1e-3, "Weight that holds this fit at zero, as a part of the weight of the tracks.", gt=0
+    )
+    blur_px: float = setting(1.5, "Standard deviation of the blur before images are compared, working px.", gt=0)
+    patch_px: int = setting(5, "Side of the patch over which differences of colour are averaged, working px.", ge=1)
+    contrast_window_px: int = setting(
+        15, "Side of the window whose contrast says how a moved pixel would differ, working px.", ge=3
+    )
+    prediction_sigma_px: float = setting(
+        1.0, "Standard deviation of a predicted position apart from depth, working px.", ge=0
+    )
+    evidence_limits: tuple[float, float] = setting(
+        (-1.0, 3.0), "Least and largest evidence of a pixel in one pair of frames, in units of log odds."
+    )
+    track_reach_px: float = setting(
+        4.0, "How far a track's evidence reaches over the pixels around it, working px.", gt=0
+    )
+    track_undecided: float = setting(
+        0.5, "Undecided tracks that are added at every pixel: with more of them, single tracks say less.", gt=0
+    )

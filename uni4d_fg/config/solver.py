@@ -10,7 +10,7 @@ from uni4d_fg.config.base import Section, setting
 class SolverConfig(Section):
     """Options of one Levenberg-Marquardt solve."""
 
-    max_iterations: int = setting(50, "Largest number of linearisations.", ge=1)
+    max_iterations: int = setting(50, "Largest number of linearizations.", ge=1, basic=True)
     relative_decrease: float = setting(
         1e-5, "Stop when an accepted step lowers the energy by less than this part.", gt=0, lt=1
     )

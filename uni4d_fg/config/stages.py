@@ -11,8 +11,8 @@ from uni4d_fg.config.solver import KernelConfig, SolverConfig
 class CameraMotionConfig(Section):
     """E_cam: relative change of successive relative motions."""
 
-    rotation_weight: float = setting(1.0, "Weight of E_rot; 0 switches it off.", ge=0)
-    translation_weight: float = setting(1.0, "Weight of E_trans; 0 switches it off.", ge=0)
+    rotation_weight: float = setting(1.0, "Weight of E_rot; 0 switches it off.", ge=0, basic=True)
+    translation_weight: float = setting(1.0, "Weight of E_trans; 0 switches it off.", ge=0, basic=True)
     rotation_floor_rad: float = setting(
         2e-3,
         "Guard added to the denominator of E_rot, rad: a camera at rest has zero, not infinite, energy.",
@@ -20,16 +20,18 @@ class CameraMotionConfig(Section):
     )
     translation_floor_m: float = setting(1e-3, "Guard added to the denominator of E_trans, m.", gt=0)
     norm_threshold: float = setting(
-        3e-3, "Smoothing at zero of both norms ('unsquared' only); the larger, the farther the minimum moves.", gt=0
+        3e-3, "Smoothing at zero of both norms (energy 'paper' only); the larger, the farther the minimum moves.", gt=0
     )
 
 
 class CameraInitConfig(Section):
     """Stage 1: poses by depth reprojection over a sliding window that stays attached to older frames."""
 
-    window: int = setting(5, "Frames in the window; the oldest is held fixed once the window has slid.", ge=2)
+    window: int = setting(
+        5, "Frames in the window; the oldest is held fixed once the window has slid.", ge=2, basic=True
+    )
     max_tracks_per_pair: int = setting(
-        400, "Tracks used per frame pair, spread evenly over those available; 0 uses all.", ge=0
+        400, "Tracks used per frame pair, spread evenly over those available; 0 uses all.", ge=0, basic=True
     )
     min_tracks_per_frame: int = setting(12, "Frames with fewer usable tracks are bridged by constant velocity.", ge=3)
     free_intrinsics: bool = setting(
@@ -41,30 +43,38 @@ class CameraInitConfig(Section):
     aspect_prior_sigma: float = setting(
         1e-3, "Standard deviation of log(fx / fy) about the given intrinsics' own: pixels keep their shape.", gt=0
     )
-    reprojection_sigma_px: float = setting(1.0, "Standard deviation of a depth reprojection residual, px.", gt=0)
+    reprojection_sigma_px: float = setting(
+        1.0, "Standard deviation of a depth reprojection residual, px.", gt=0, basic=True
+    )
     kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of depth reprojection.")
     camera_motion: CameraMotionConfig = setting(
         CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0), "E_cam within the window."
     )
-    solver: SolverConfig = setting(SolverConfig(max_iterations=20, relative_decrease=1e-5), "Solver of each window.")
+    solver: SolverConfig = setting(
+        SolverConfig(max_iterations=20, relative_decrease=1e-5), "Solver of each window.", basic=True
+    )
 
 
 class BundleAdjustmentConfig(Section):
     """Stage 2: poses, intrinsics, depth scales and landmarks together."""
 
-    free_principal_point: bool = setting(False, "Free cx, cy too (if input.intrinsics is free).")
+    free_principal_point: bool = setting(False, "Free cx, cy too (if input.intrinsics is free).", basic=True)
     focal_prior_fraction: float = setting(
-        0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0
+        0.2, "Standard deviation of the focal lengths' prior, as a part of their value.", gt=0, basic=True
     )
     aspect_prior_sigma: float = setting(
         1e-3, "Standard deviation of log(fx / fy) about the given intrinsics' own: pixels keep their shape.", gt=0
     )
-    reprojection_sigma_px: float = setting(1.0, "Starting standard deviation of static reprojection, px.", gt=0)
-    depth_sigma: float = setting(0.03, "Starting standard deviation of log depth.", gt=0)
-    measure_noise: bool = setting(
-        True, "Replace both by the static scene's own (median absolute deviation) after a first solve."
+    reprojection_sigma_px: float = setting(
+        1.0, "Starting standard deviation of static reprojection, px.", gt=0, basic=True
     )
-    reprojection_sigma_factor: float = setting(1.0, "Measured reprojection sigma is multiplied by this.", gt=0)
+    depth_sigma: float = setting(0.03, "Starting standard deviation of log depth.", gt=0, basic=True)
+    measure_noise: bool = setting(
+        True, "Replace both by the static scene's own (median absolute deviation) after a first solve.", basic=True
+    )
+    reprojection_sigma_factor: float = setting(
+        1.0, "Measured reprojection sigma is multiplied by this.", gt=0, basic=True
+    )
     depth_correlation: float = setting(
         0.5, "Starting correlation of the log-depth errors along a track; then measured.", ge=0, le=1
     )
@@ -73,24 +83,31 @@ class BundleAdjustmentConfig(Section):
         "The depth prior of the camera solves is this much wider than its correlation along tracks says: a cue errs "
         "alike in neighbouring pixels too.",
         gt=0,
+        basic=True,
     )
     min_reprojection_sigma_px: float = setting(0.1, "Floor of the measured reprojection sigma, px.", gt=0)
     min_depth_sigma: float = setting(0.002, "Floor of the measured depth sigma.", gt=0)
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=0.7), "Kernel of E_BA.")
     depth_kernel: KernelConfig = setting(KernelConfig(kind="cauchy", threshold=2.0), "Kernel of the depth prior.")
     depth_prior: bool = setting(
-        True, "Use the depth prior with a log-scale per frame; without it one distance anchors the scale."
+        True, "Use the depth prior with a log-scale per frame; without it one distance anchors the scale.", basic=True
+    )
+    scale_anchor_sigma: float = setting(
+        1e-3, "Standard deviation of the one distance that anchors the scale where there is no depth prior, m.", gt=0
     )
     depth_scale_prior_sigma: float = setting(0.05, "Standard deviation of a frame's log-scale about zero.", gt=0)
     camera_motion: CameraMotionConfig = setting(
-        CameraMotionConfig(rotation_weight=1.0, translation_weight=500.0), "E_cam."
+        CameraMotionConfig(rotation_weight=1.0, translation_weight=500.0), "E_cam.", basic=True
     )
-    max_reprojection_px: float = setting(8.0, "Observations above this after the first solve are dropped, px.", gt=0)
-    min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2)
+    max_reprojection_px: float = setting(
+        8.0, "Observations above this after the first solve are dropped, px.", gt=0, basic=True
+    )
+    min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2, basic=True)
     max_depth_ratio: float = setting(
         1.5,
         "Landmarks whose depth disagrees with the cue's median by more than this factor are dropped.",
         gt=1,
+        basic=True,
     )
     outlier_quantile: float = setting(
         0.98,
@@ -115,7 +132,7 @@ class BundleAdjustmentConfig(Section):
         "the depth prior at its measured sigma; 'relift': mean lift of the depth cue (the reference's choice); "
         "'keep': as they are.",
     )
-    solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.")
+    solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.", basic=True)
     structure_solver: SolverConfig = setting(
         SolverConfig(max_iterations=40, relative_decrease=1e-6),
         "Solver of 'refine': nothing couples the landmarks but the scales, and small steps still pay.",
@@ -125,7 +142,7 @@ class BundleAdjustmentConfig(Section):
 class NonRigidConfig(Section):
     """Stage 3: one point per dynamic track and frame, cameras frozen."""
 
-    neighbours: int = setting(6, "ARAP neighbours per track, within its own instance.", ge=0)
+    neighbours: int = setting(6, "ARAP neighbours per track, within its own instance.", ge=0, basic=True)
     max_neighbour_ratio: float = setting(
         6.0,
         "Neighbours farther than this many times the instance's median neighbour distance are not linked.",
@@ -138,6 +155,7 @@ class NonRigidConfig(Section):
     bridge_gaps: bool = setting(
         True,
         "Estimate a track's points in the frames between its first and last observation in which it is hidden.",
+        basic=True,
     )
     local_scale_neighbours: int = setting(
         32,
@@ -145,24 +163,27 @@ class NonRigidConfig(Section):
         "that predicts better than the frame's scale; 0 always takes the frame's scale.",
         ge=0,
     )
+    local_scale_samples: int = setting(
+        512, "Static observations per frame on which that prediction is measured, at most.", ge=8
+    )
     reprojection: bool = setting(True, "Use E_NR.")
-    depth_prior: bool = setting(True, "Use the depth prior.")
+    depth_prior: bool = setting(True, "Use the depth prior.", basic=True)
     reprojection_sigma_px: float | None = setting(
-        None, "Sigma of E_NR, px; null takes the one measured on the static scene.", gt=0
+        None, "Sigma of E_NR, px; null takes the one measured on the static scene.", gt=0, basic=True
     )
     depth_sigma: float | None = setting(
-        None, "Sigma of log depth; null takes the one measured on the static scene.", gt=0
+        None, "Sigma of log depth; null takes the one measured on the static scene.", gt=0, basic=True
     )
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of E_NR.")
     depth_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of the depth prior.")
     smoothness_order: Literal[1, 2] = setting(2, "1: first difference (velocity); 2: second difference (acceleration).")
     smoothness_sigma_m: float = setting(
-        0.004, "Sigma of the difference, m. 'default': a point's acceleration per frame^2.", gt=0
+        0.004, "Sigma of the difference, m. 'default': a point's acceleration per frame^2.", gt=0, basic=True
     )
-    smoothness_weight: float = setting(1.0, "Weight of temporal smoothness; 0 switches the term off.", ge=0)
+    smoothness_weight: float = setting(1.0, "Weight of temporal smoothness; 0 switches the term off.", ge=0, basic=True)
     smoothness_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
-    arap_sigma_m: float = setting(0.01, "Sigma of the change of a neighbour distance, m.", gt=0)
-    arap_weight: float = setting(1.0, "Weight of ARAP; 0 switches the term off.", ge=0)
+    arap_sigma_m: float = setting(0.01, "Sigma of the change of a neighbour distance, m.", gt=0, basic=True)
+    arap_weight: float = setting(1.0, "Weight of ARAP; 0 switches the term off.", ge=0, basic=True)
     arap_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
     annealing: tuple[float, ...] = setting(
         (1.0,), "Successive solves with the smoothing of every 'norm' kernel multiplied by these factors; ends at 1."
@@ -178,7 +199,11 @@ class NonRigidConfig(Section):
         True, "Solve a second time without that first solve, and keep whichever ends at the lower energy."
     )
     outlier_quantile: float = setting(
-        0.98, "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.", gt=0, le=1
+        0.98,
+        "Tracks whose motion energy exceeds this quantile plus outlier_margin are dropped.",
+        gt=0,
+        le=1,
+        basic=True,
     )
     outlier_margin: float = setting(1.0, "Added to that quantile.", ge=0)
     solver: SolverConfig = setting(
@@ -190,6 +215,7 @@ class NonRigidConfig(Section):
             cg_tolerance=0.06,
         ),
         "Solver.",
+        basic=True,
     )
 
 
@@ -208,18 +234,23 @@ class FusionConfig(Section):
         "Control scales farther than this many measured depth sigmas from the frame's log-scale are discarded.",
         gt=0,
     )
-    stride: int = setting(4, "Scales are interpolated on a grid of this spacing and bilinearly in between, px.", ge=1)
+    stride: int = setting(
+        4, "Scales are interpolated on a grid of this spacing and bilinearly in between, px.", ge=1, basic=True
+    )
     averaged_offsets: tuple[int, ...] = setting(
         (1, 2, 4, 6, 8),
         "Static depth is averaged with that of the frames this far before and after; empty leaves it out.",
+        basic=True,
     )
     averaged_sigmas: float = setting(
-        2.5, "... where their logarithms differ by less than this many measured depth sigmas.", gt=0
+        2.5,
+        "Static depth of two frames is averaged where its logarithms differ by less than this many measured sigmas.",
+        gt=0,
     )
     edge_relative_gradient: float = setting(
         0.05, "Pixels whose depth changes by more than this part per pixel are left out of the clouds.", gt=0
     )
-    static_stride: int = setting(4, "The static cloud takes every this many pixels in x and y.", ge=1)
-    static_frame_stride: int = setting(5, "... of every this many frames.", ge=1)
-    static_voxel_m: float = setting(0.01, "Voxel size of the static cloud, m; 0 keeps every point.", ge=0)
-    dynamic_stride: int = setting(2, "The dynamic clouds take every this many pixels in x and y.", ge=1)
+    static_stride: int = setting(4, "The static cloud takes every this many pixels in x and y.", ge=1, basic=True)
+    static_frame_stride: int = setting(5, "It takes every this many frames.", ge=1)
+    static_voxel_m: float = setting(0.01, "Voxel size of the static cloud, m; 0 keeps every point.", ge=0, basic=True)
+    dynamic_stride: int = setting(2, "The dynamic clouds take every this many pixels in x and y.", ge=1, basic=True)

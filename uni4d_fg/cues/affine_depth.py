@@ -10,7 +10,7 @@ Points of known depth ``z_{k,t}`` determine both, robustly, all frames at once:
       + sum_t sum_q ( ((a_{t+1} - a_t) q + (b_{t+1} - b_t)) / (tau m_t) )^2 / 6
 
 m_t is the frame's median 1/z, sigma the measured noise, rho a robust kernel (Cauchy's, started
-from Huber's); q runs over three quantiles of the
+from Huber's); q runs over some quantiles of the
 network's values at the points, so that tau says how much the aligned inverse depth may change from frame to frame
 through a and b alone, whatever the network's own unit and origin. A frame with many points hardly feels it; one
 with few follows its neighbours.
@@ -33,17 +33,17 @@ from uni4d_fg.config.geometric_depth import AffineDepthConfig
 from uni4d_fg.cues.structure.triangulation import median_per_row
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.factors.kernels import Kernel
+from uni4d_fg.frontend.sequence.frames import LazyFrames
+from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.frontend.sequence.problems import some_of
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
-from uni4d_fg.sequence.frames import LazyFrames
-from uni4d_fg.sequence.model import FrameSource
-from uni4d_fg.sequence.problems import some_of
-from uni4d_fg.stages.noise import robust_sigma
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.slam.stages.noise import robust_sigma
 
-_QUANTILES = (0.1, 0.5, 0.9)
-_MIN_SIGMA = 1e-3
 _CONVERGED = 1e-5
+"""A change below this part of the solution ends the reweighted solves."""
 _RIDGE = 1e-12
+"""Relative addition to the diagonal, against rounding."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def _fit(samples: _Samples, count: int, config: AffineDepthConfig, free_shift: b
     unit = max(robust_sigma(samples.value - origin), 1e-12)
     value = (samples.value - origin) / unit
     target = samples.target / typical[samples.frame]
-    probes = np.quantile(value, _QUANTILES)
+    probes = np.quantile(value, config.probe_quantiles)
     link = _link(typical, probes, config.temporal_sigma)
     weight = np.ones(len(value))
     solution = np.zeros((count, 2))
@@ -229,7 +229,7 @@ def _fit(samples: _Samples, count: int, config: AffineDepthConfig, free_shift: b
             residual = scale * value + shift - target
             # About the frame's median: what is off as a whole is not noise, but a fit that outliers still hold.
             middle = median_per_row(residual, samples.frame, count)[samples.frame]
-            sigma = max(robust_sigma(residual - middle), _MIN_SIGMA)
+            sigma = max(robust_sigma(residual - middle), config.min_sigma)
             weight = kernel.weight((residual / sigma) ** 2)
             # The first solve still has the weights of the kernel before.
             if iteration and np.abs(solution - previous).max() <= _CONVERGED * np.abs(solution).max():

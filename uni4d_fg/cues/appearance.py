@@ -23,13 +23,10 @@ from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.depth_range import DepthRange, depth_range
 from uni4d_fg.cues.static_scene import predict_static
 
-_BLUR_PX = 1.5
-_WINDOW_PX = 5
-_SURROUNDING_PX = 15
-_PREDICTION_SIGMA_PX = 1.0
 _MEDIAN_OF_SQUARE = 0.455
-_LIMITS = (-1.0, 3.0)
+"""Of the square of a standard normal variable."""
 _SAMPLE = 4
+"""Medians over an image take every fourth pixel in x and y."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,9 @@ class FrameAppearance:
     """With the frame's depth scale."""
 
 
-def frame_appearance(image: ImageArray, depth: Float32Array, log_scale: float, edge_window_px: int) -> FrameAppearance:
+def frame_appearance(
+    image: ImageArray, depth: Float32Array, log_scale: float, edge_window_px: int, config: MotionMaskConfig
+) -> FrameAppearance:
     """Prepare a frame.
 
     Args:
@@ -54,10 +53,11 @@ def frame_appearance(image: ImageArray, depth: Float32Array, log_scale: float, e
         depth: (h, w) metres, NaN where missing.
         log_scale: Log of the factor that makes the depth agree with the cameras.
         edge_window_px: Side of the window in which depth may be displaced.
+        config: Blur and windows.
     """
-    colour = cv2.GaussianBlur(image, (0, 0), _BLUR_PX).astype(np.float32)
+    colour = cv2.GaussianBlur(image, (0, 0), config.blur_px).astype(np.float32)
     gx, gy = (cv2.Sobel(colour, -1, 1 - axis, axis, ksize=3) / 8 for axis in (0, 1))
-    window = (_SURROUNDING_PX, _SURROUNDING_PX)
+    window = (config.contrast_window_px, config.contrast_window_px)
     variance = cv2.boxFilter(colour * colour, -1, window) - cv2.boxFilter(colour, -1, window) ** 2
     scaled = depth * np.float32(np.exp(log_scale))
     return FrameAppearance(
@@ -97,12 +97,12 @@ def moved_evidence(
     if not some.any():
         return np.zeros((height, width), np.float32)
     difference -= np.median(difference[::_SAMPLE, ::_SAMPLE][some], axis=0)  # exposure
-    squared = cv2.boxFilter((difference * difference).sum(axis=2), -1, (_WINDOW_PX, _WINDOW_PX))
+    squared = cv2.boxFilter((difference * difference).sum(axis=2), -1, (config.patch_px, config.patch_px))
 
     sigma_depth = config.depth_sigma + 0.5 * source.depth.spread
     du, dv = sigma_depth * static.du, sigma_depth * static.dv
     gxx, gxy, gyy = source.gradient
-    variance = 3 * config.intensity_sigma**2 + _PREDICTION_SIGMA_PX**2 * (gxx + gyy)
+    variance = 3 * config.intensity_sigma**2 + config.prediction_sigma_px**2 * (gxx + gyy)
     variance += du * du * gxx + 2 * du * dv * gxy + dv * dv * gyy
     # Blur and noise of this pair of frames: most of the image is static.
     variance *= max(1.0, float(np.median((squared / variance)[::_SAMPLE, ::_SAMPLE][some])) / _MEDIAN_OF_SQUARE)
@@ -114,4 +114,4 @@ def moved_evidence(
         for values in (target.depth.nearest, target.depth.known.astype(np.float32))
     )
     hidden = (known > 0) & (nearest < static.log_z - config.occlusion_margin)
-    return np.where(inside & ~hidden, np.clip(evidence, *_LIMITS), 0).astype(np.float32)
+    return np.where(inside & ~hidden, np.clip(evidence, *config.evidence_limits), 0).astype(np.float32)

@@ -21,7 +21,7 @@ from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.errors import InputError, OutputError
 from uni4d_fg.files import atomic_path, atomic_write_text, load_npy, load_npz, save_npy, save_npz
-from uni4d_fg.sequence.frames import FileFrames
+from uni4d_fg.frontend.sequence.frames import FileFrames
 
 CACHE_VERSION = 1
 """Part of every key; raised whenever a maker gives other cues for the same image, card and configuration."""

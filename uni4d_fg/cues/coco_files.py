@@ -17,10 +17,10 @@ from uni4d_fg.cues.detections import MOVABLE_CLASSES, FrameDetections, movable_c
 from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.label_store import CompressedLabels
 from uni4d_fg.cues.rle import decode_rle
-from uni4d_fg.sequence.frames import ConstantFrames, LazyFrames
-from uni4d_fg.sequence.layout import frame_numbers
-from uni4d_fg.sequence.model import FrameSource
-from uni4d_fg.sequence.problems import SequenceProblem, some_of
+from uni4d_fg.frontend.sequence.frames import ConstantFrames, LazyFrames
+from uni4d_fg.frontend.sequence.layout import frame_numbers
+from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
 
 _REWRITE = "write it as COCO results: a list of {image_id, category_id, score, segmentation: {size, counts}}"
 

@@ -14,7 +14,7 @@ from uni4d_fg.cues.card import DepthCard, ModelFile
 from uni4d_fg.cues.preprocess import Placement, input_shape, place, prepare
 from uni4d_fg.cues.session import Network
 from uni4d_fg.errors import ConfigError
-from uni4d_fg.sequence.calibration import implausible
+from uni4d_fg.frontend.sequence.calibration import implausible
 
 _SMALLEST_INVERSE = 1e-6
 

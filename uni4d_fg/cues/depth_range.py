@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array
-from uni4d_fg.sequence.model import FrameSource
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.frontend.track_model import Tracks
 
 _FAR = np.float32(1e3)
 UNKNOWN_RANGE = 2.0

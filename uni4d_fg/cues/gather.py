@@ -18,13 +18,13 @@ from uni4d_fg.cues.manifest import save_manifest
 from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_masks, network_tracks
 from uni4d_fg.cues.plan import CuePlan, CueReport
 from uni4d_fg.errors import ConfigError
+from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.calibration import guess_intrinsics
+from uni4d_fg.frontend.sequence.frames import no_masks
+from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.progress import Reporter, SilentReporter
-from uni4d_fg.sequence.assemble import as_sequence
-from uni4d_fg.sequence.calibration import guess_intrinsics
-from uni4d_fg.sequence.frames import no_masks
-from uni4d_fg.sequence.model import FrameSource, Sequence, Video
-from uni4d_fg.tracks.cache import load_or_track
-from uni4d_fg.tracks.model import Tracks
 
 NOT_METRIC = (
     "depth is not metric: no depth was given, so it was found from the motion of the camera, which does not see scale; "

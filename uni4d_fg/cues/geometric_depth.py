@@ -25,17 +25,19 @@ from uni4d_fg.cues.interpolated_depth import (
 from uni4d_fg.cues.structure.motion import Structure, rotations_only, structure_from_motion
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
+from uni4d_fg.frontend.sequence.model import FrameSource, Video
+from uni4d_fg.frontend.sequence.problems import some_of
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.progress import Reporter, SilentReporter
-from uni4d_fg.sequence.model import FrameSource, Video
-from uni4d_fg.sequence.problems import some_of
-from uni4d_fg.stages.observations import Observations
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.slam.stages.observations import Observations
 
 _UNSURE_FOCAL = 0.03
+"""A relative standard deviation of the focal length above this is warned of."""
 _FEW_FRAMES = 0.5
-_MIN_POINTS = 3
+"""Fewer frames with a pose than this part of the video are warned of."""
 _SPHERE_STEP = 16
+"""Spacing of the nodes between which a sphere is interpolated, px."""
 _PLAUSIBLE_FOCAL = (0.4, 3.0)
 """Focal lengths, as parts of the longer image side, that cameras have: 103 to 19 degrees."""
 
@@ -232,7 +234,7 @@ def _inverse_depths(structure: Structure, observations: Observations, config: Ge
         sigma = inverse_depth_sigma(pose, position[good], information, max(structure.sigma_px, 0.1))
         inverse = 1.0 / z
         typical = float(np.median(inverse))
-        fine = (sigma <= config.max_relative_sigma * typical) & supported(observations.uv[mine], inverse)
+        fine = (sigma <= config.max_relative_sigma * typical) & supported(observations.uv[mine], inverse, config)
         out[mine[fine]] = np.maximum(inverse[fine], typical / config.max_depth_ratio)
     return out
 
@@ -246,7 +248,7 @@ def _points_per_frame(
     for frame in range(num_frames):
         mine = known & (observations.frame == frame)
         found.append(SparseInverseDepth(observations.uv[mine], inverse[mine]))
-    filled = np.array([len(points.inverse_depth) >= _MIN_POINTS for points in found])
+    filled = np.array([len(points.inverse_depth) >= config.min_interpolated_points for points in found])
     if not filled.any():
         everywhere = SparseInverseDepth(np.zeros((1, 2)), np.array([1.0 / config.median_depth]))
         return (everywhere,) * num_frames

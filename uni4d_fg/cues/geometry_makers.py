@@ -19,10 +19,10 @@ from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.frames import MaskFolder
+from uni4d_fg.frontend.sequence.model import FrameSource, Video
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter
-from uni4d_fg.sequence.frames import MaskFolder
-from uni4d_fg.sequence.model import FrameSource, Video
-from uni4d_fg.tracks.model import Tracks
 
 ShouldStop = Callable[[], bool]
 

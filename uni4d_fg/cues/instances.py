@@ -21,11 +21,10 @@ from uni4d_fg.config.motion_masks import InstanceConfig
 from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_grey, shrunk_size, warp_back, working_scale
 from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.sequence.model import FrameSource
+from uni4d_fg.frontend.sequence.model import FrameSource
 
-_PART = 0.5
-_HIDDEN_BONUS = 0.5
 _UNASSIGNABLE = 1e3
+"""Cost of a pair that is not to be: far above the cost 1 of no overlap."""
 
 
 @dataclass
@@ -158,7 +157,7 @@ def _assign(
     affinity = overlap.copy()
     for row, instance in enumerate(instances):
         if instance.missed:  # What comes out from behind something is at first only partly seen.
-            affinity[row] = np.maximum(affinity[row], _HIDDEN_BONUS * within[row])
+            affinity[row] = np.maximum(affinity[row], config.hidden_overlap_weight * within[row])
         if config.same_class:
             affinity[row, found.class_ids != instance.class_id] = 0
     possible = affinity >= config.min_overlap
@@ -170,7 +169,7 @@ def _assign(
     taken = {row for row, _ in pairs}
     if config.join_parts:
         for column in np.flatnonzero(number_of == 0).tolist():
-            rows_around = [row for row in taken if within[row, column] >= _PART]
+            rows_around = [row for row in taken if within[row, column] >= config.min_part_overlap]
             if rows_around:
                 best = max(rows_around, key=lambda row: float(within[row, column]))
                 number_of[column] = instances[best].number

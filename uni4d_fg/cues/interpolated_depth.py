@@ -18,13 +18,11 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array, evenly_spread
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
-from uni4d_fg.sequence.frames import LazyFrames
-from uni4d_fg.sequence.model import FrameSource
+from uni4d_fg.frontend.sequence.frames import LazyFrames
+from uni4d_fg.frontend.sequence.model import FrameSource
 
-_NEIGHBOURS = 8
-_SUPPORTERS = 2
-_LIKE = 1.25
 _MAX_CONTACT_COLUMNS = 200
+"""Columns whose median says where a thing stands: more only take longer."""
 
 
 @dataclass(frozen=True)
@@ -99,16 +97,17 @@ def evaluate(points: SparseInverseDepth, uv: FloatArray) -> FloatArray:
     return result
 
 
-def supported(uv: FloatArray, inverse_depth: FloatArray) -> BoolArray:
+def supported(uv: FloatArray, inverse_depth: FloatArray, config: GeometricDepthConfig) -> BoolArray:
     """Return which points (N,) have a few of their nearest neighbours in the image at a similar depth.
 
     A wrong point stands alone; beside a depth edge there are neighbours on either side.
     """
-    if len(uv) <= _NEIGHBOURS:
+    if len(uv) <= config.support_neighbours:
         return np.ones(len(uv), dtype=bool)
-    _, index = cKDTree(uv).query(uv, k=_NEIGHBOURS + 1)
+    _, index = cKDTree(uv).query(uv, k=config.support_neighbours + 1)
     ratio = inverse_depth[index[:, 1:]] / inverse_depth[:, None]
-    result: BoolArray = np.count_nonzero((ratio < _LIKE) & (ratio > 1.0 / _LIKE), axis=1) >= _SUPPORTERS
+    like = (ratio < config.support_ratio) & (ratio > 1.0 / config.support_ratio)
+    result: BoolArray = np.count_nonzero(like, axis=1) >= config.min_supporters
     return result
 
 

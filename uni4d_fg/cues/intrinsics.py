@@ -9,6 +9,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 
 _TUKEY = 4.685
+"""Sigmas beyond which a value does not count: 95 % efficient on normal noise."""
 _GAUSSIAN = 1.4826
 _ROUNDS = 20
 _SMALL = 1e-9

@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 
 from uni4d_fg.arrays import Int32Array
-from uni4d_fg.sequence.frames import LazyFrames
+from uni4d_fg.frontend.sequence.frames import LazyFrames
 
 
 class CompressedLabels(LazyFrames[Int32Array]):

@@ -14,10 +14,10 @@ from uni4d_fg.cues.cache import FloatMaps
 from uni4d_fg.cues.plan import CuePlan, CueReport
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_write_json, load_npy, save_npy
-from uni4d_fg.sequence.assemble import as_sequence
-from uni4d_fg.sequence.frames import FileFrames, MaskFolder, no_masks
-from uni4d_fg.sequence.model import FrameSource, Sequence, Video
-from uni4d_fg.tracks.io import load_tracks, save_tracks
+from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.frames import FileFrames, MaskFolder, no_masks
+from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
 
 MANIFEST = "cues.json"
 _FORMAT = 1

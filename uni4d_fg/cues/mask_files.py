@@ -22,11 +22,11 @@ from uni4d_fg.arrays import ImageArray, Int32Array
 from uni4d_fg.config.motion_masks import InstanceConfig
 from uni4d_fg.cues.coco_files import open_coco_masks, read_json
 from uni4d_fg.cues.detections import movable_class_ids
-from uni4d_fg.sequence.decode import read_mask
-from uni4d_fg.sequence.frames import FileFrames, LazyFrames
-from uni4d_fg.sequence.layout import MASK_SUFFIXES, frame_numbers, is_visible_file, list_frames, subfolders
-from uni4d_fg.sequence.model import FrameSource
-from uni4d_fg.sequence.problems import SequenceProblem, some_of
+from uni4d_fg.frontend.sequence.decode import read_mask
+from uni4d_fg.frontend.sequence.frames import FileFrames, LazyFrames
+from uni4d_fg.frontend.sequence.layout import MASK_SUFFIXES, frame_numbers, is_visible_file, list_frames, subfolders
+from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
 
 _ANNOTATION_FOLDERS = ("Annotations", "pan_pred")
 _DEVA_CLASSES = "pred.json"
@@ -172,7 +172,7 @@ def _deva_ids(path: Path, classes: tuple[str, ...], class_names: dict[int, str] 
 
 
 def read_ids(path: Path) -> Int32Array:
-    """Read a label map like :func:`~uni4d_fg.sequence.decode.read_mask`, but a palette PNG by its index.
+    """Read a label map like :func:`~uni4d_fg.frontend.sequence.decode.read_mask`, but a palette PNG by its index.
 
     Programs that write ids with a palette mean the index; the colours are only for looking at.
 

@@ -34,14 +34,15 @@ from uni4d_fg.cues.moving_regions import moving_region, track_evidence, trusted_
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.static_scene import relative_pose
-from uni4d_fg.cues.track_motion import Cameras, SharedError, TrackMotion, find_moving_tracks
+from uni4d_fg.cues.track_motion import SharedError, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.sequence.model import FrameSource, Video
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
-from uni4d_fg.sequence.model import FrameSource, Video
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.slam.stages.scene import Cameras
 
 _MOST_MAY_MOVE = 0.6
-_TURNS = 2
+"""More than this part of the image, or of the tracks, is warned of."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def motion_masks(
         if count != video.num_frames:
             raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
-    report.begin("motion of tracks", _TURNS)
+    report.begin("motion of tracks", config.camera_rounds)
     cameras, motion = _tracks_and_cameras(video, depths, tracks, intrinsics, config, settings, report, stop)
     report.end()
     report.begin("motion masks", video.num_frames)
@@ -147,7 +148,7 @@ def _tracks_and_cameras(
     spread = spread_at_tracks(known.labelled.tracks, depths, max(1, round(config.depth_edge_px)))
     outlier = moving = find_outlier_tracks(known.labelled, intrinsics, config)
     cameras, motion = None, None
-    for turn in range(_TURNS):
+    for turn in range(config.camera_rounds):
         cameras = solve_cameras(
             known.labelled.without(moving),
             intrinsics,
@@ -215,7 +216,7 @@ class _Comparison:
             depth = cv2.resize(self.depths[frame], (width, height), interpolation=cv2.INTER_NEAREST)
             edge = max(1, round(self.config.depth_edge_px * float(self.scale.mean())))
             self.images[frame] = image
-            self.frames[frame] = frame_appearance(image, depth, float(self.cameras.log_scale[frame]), edge)
+            self.frames[frame] = frame_appearance(image, depth, float(self.cameras.log_scale[frame]), edge, self.config)
         return self.frames[frame]
 
     def _forget_before(self, frame: int) -> None:
@@ -232,7 +233,7 @@ class _Comparison:
                 count += 1
         if count:
             total *= len(self.config.baselines) / count
-        tracks = track_evidence(self.tracks, self.motion, frame, self.size, self.scale)
+        tracks = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
         return total + np.float32(self.config.track_weight) * tracks
 
     def _pair(self, source: int, target: int) -> Float32Array:

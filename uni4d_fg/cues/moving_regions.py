@@ -9,14 +9,16 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.guided_filter import guided_filter
 from uni4d_fg.cues.track_motion import TrackMotion
-from uni4d_fg.tracks.model import Tracks
-
-_TRACK_REACH_PX = 4.0
-_SURROUND = 0.5
+from uni4d_fg.frontend.track_model import Tracks
 
 
 def track_evidence(
-    tracks: Tracks, motion: TrackMotion, frame: int, size: tuple[int, int], scale: FloatArray
+    tracks: Tracks,
+    motion: TrackMotion,
+    frame: int,
+    size: tuple[int, int],
+    scale: FloatArray,
+    config: MotionMaskConfig,
 ) -> Float32Array:
     """Spread what the tracks of a frame say over the pixels around them.
 
@@ -26,22 +28,27 @@ def track_evidence(
         frame: The frame.
         size: (h, w) at working size.
         scale: (2,) working pixels per image pixel, x and y.
+        config: Reach of a track, and how much few of them say.
 
     Returns:
         (h, w) from -1 (static tracks only) over 0 (none, or undecided) to 1 (moving tracks only).
     """
-    moving, static = (_splat(tracks, which, frame, size, scale) for which in (motion.moving, motion.static))
-    return ((moving - static) / (moving + static + _SURROUND)).astype(np.float32)
+    moving, static = (
+        _splat(tracks, which, frame, size, scale, config.track_reach_px) for which in (motion.moving, motion.static)
+    )
+    return ((moving - static) / (moving + static + config.track_undecided)).astype(np.float32)
 
 
-def _splat(tracks: Tracks, which: BoolArray, frame: int, size: tuple[int, int], scale: FloatArray) -> Float32Array:
+def _splat(
+    tracks: Tracks, which: BoolArray, frame: int, size: tuple[int, int], scale: FloatArray, reach_px: float
+) -> Float32Array:
     seen = which & tracks.visible[:, frame]
     uv = (tracks.uv[seen, frame] + 0.5) * scale
     column, row = uv.astype(np.int64).T
     image = np.zeros(size, np.float32)
     np.add.at(image, (np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)), np.float32(1))
-    peak = 2 * np.pi * _TRACK_REACH_PX**2
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), _TRACK_REACH_PX) * np.float32(peak))
+    peak = 2 * np.pi * reach_px**2
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), reach_px) * np.float32(peak))
 
 
 def moving_region(

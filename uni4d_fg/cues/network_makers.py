@@ -20,11 +20,11 @@ from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.point_tracker_network import PointTrackerNetwork
 from uni4d_fg.cues.segmentation_network import SegmentationNetwork
 from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.sequence.frames import MaskFolder
+from uni4d_fg.frontend.sequence.model import Video
+from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
 from uni4d_fg.progress import Reporter
-from uni4d_fg.sequence.frames import MaskFolder
-from uni4d_fg.sequence.model import Video
-from uni4d_fg.tracks.io import load_tracks, save_tracks
-from uni4d_fg.tracks.model import Tracks
 
 ShouldStop = Callable[[], bool]
 

@@ -13,13 +13,9 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray, evenly_spread
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static
+from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
+from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import unproject
-from uni4d_fg.sequence.calibration import intrinsics_matrix
-from uni4d_fg.tracks.model import LabelledTracks
-
-_MIN_TRACKS = 12
-_MAX_TRACKS = 600
-_ITERATIONS = 200
 
 
 def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config: MotionMaskConfig) -> BoolArray:
@@ -28,7 +24,7 @@ def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config
     Args:
         labelled: K tracks with depth; labels and weights are not read.
         intrinsics: (4,) px; roughly right is enough over a few frames.
-        config: ``first_guess_step`` and ``first_guess_px``.
+        config: Its fields ``first_guess_...``.
     """
     num_tracks, num_frames = labelled.tracks.visible.shape
     agreed, tested = np.zeros(num_tracks), np.zeros(num_tracks)
@@ -37,11 +33,11 @@ def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config
         target = source + step
         seen = labelled.tracks.visible[:, source] & labelled.tracks.visible[:, target]
         track = np.flatnonzero(seen & np.isfinite(labelled.depth[:, source]))
-        if len(track) < _MIN_TRACKS:
+        if len(track) < config.first_guess_min_tracks:
             continue
         uv, uv_target = (labelled.tracks.uv[track, frame].astype(np.float64) for frame in (source, target))
         depth = labelled.depth[track, source].astype(np.float64)
-        pose = _majority_pose(unproject(intrinsics, uv, depth), uv_target, intrinsics, config.first_guess_px)
+        pose = _majority_pose(unproject(intrinsics, uv, depth), uv_target, intrinsics, config)
         if pose is None:
             continue
         static = predict_static(uv[:, 0], uv[:, 1], np.log(depth), pose, intrinsics)
@@ -51,13 +47,24 @@ def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config
     return np.asarray((tested > 0) & (agreed < 0.5 * tested))
 
 
-def _majority_pose(points: FloatArray, uv: FloatArray, intrinsics: FloatArray, threshold: float) -> FloatArray | None:
+def _majority_pose(
+    points: FloatArray, uv: FloatArray, intrinsics: FloatArray, config: MotionMaskConfig
+) -> FloatArray | None:
     """Return the pose (4, 4) of the points' camera in the one that sees them at ``uv``; None if none is found."""
-    thin = evenly_spread(len(points), _MAX_TRACKS)
+    thin = evenly_spread(len(points), config.first_guess_max_tracks)
     matrix = intrinsics_matrix(intrinsics)
     try:
         found, rotation, translation, _ = cv2.solvePnPRansac(
-            points[thin], uv[thin], matrix, np.zeros(4), None, None, False, _ITERATIONS, threshold, 0.999
+            points[thin],
+            uv[thin],
+            matrix,
+            np.zeros(4),
+            None,
+            None,
+            False,
+            config.first_guess_trials,
+            config.first_guess_px,
+            0.999,
         )
     except cv2.error:  # Degenerate points.
         return None

@@ -9,12 +9,12 @@ from typing import Any, Literal
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.card import CardKind, find_model
 from uni4d_fg.cues.session import weights_hash
+from uni4d_fg.frontend.sequence.assemble import check_count, open_depth
+from uni4d_fg.frontend.sequence.calibration import load_intrinsics
+from uni4d_fg.frontend.sequence.model import Video
+from uni4d_fg.frontend.sequence.problems import SequenceProblem
+from uni4d_fg.frontend.sequence.track_files import load_track_file
 from uni4d_fg.optional import import_onnxruntime
-from uni4d_fg.sequence.assemble import check_count, open_depth
-from uni4d_fg.sequence.calibration import load_intrinsics
-from uni4d_fg.sequence.model import Video
-from uni4d_fg.sequence.problems import SequenceProblem
-from uni4d_fg.sequence.track_files import load_track_file
 
 DepthSource = Literal["given", "card", "geometry"]
 MaskSource = Literal["given", "card", "motion", "none"]

@@ -21,8 +21,8 @@ from uni4d_fg.cues.card import ModelFile, TracksCard
 from uni4d_fg.cues.preprocess import Placement, place, prepare
 from uni4d_fg.cues.session import Network
 from uni4d_fg.errors import Cancelled, ConfigError
-from uni4d_fg.sequence.model import FrameSource
-from uni4d_fg.tracks.model import Tracks
+from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.frontend.track_model import Tracks
 
 _DEFAULT_POINTS = 512
 """Points per call where the file takes any number."""

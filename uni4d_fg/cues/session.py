@@ -14,8 +14,8 @@ import numpy.typing as npt
 from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.cues.card import MODELS_VARIABLE, ModelFile
 from uni4d_fg.errors import InputError, MissingDependencyError
+from uni4d_fg.optim.threads import thread_count
 from uni4d_fg.optional import import_onnxruntime
-from uni4d_fg.solve.threads import thread_count
 
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 _ERRORS_ONLY = 3

@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.track_motion import Cameras
 from uni4d_fg.errors import Cancelled, DegenerateProblemError
-from uni4d_fg.pipeline.solver import stage_runner
-from uni4d_fg.sequence.frames import no_masks
-from uni4d_fg.sequence.model import FrameSource, Sequence, Video
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.solve.summary import SolveSummary, Termination
-from uni4d_fg.stages.bundle_adjustment import Freedom, adjust_bundle
-from uni4d_fg.stages.camera_init import initialize_cameras
-from uni4d_fg.stages.observations import observations_of, weigh_by_drift
-from uni4d_fg.tracks.labels import label_tracks
-from uni4d_fg.tracks.model import LabelledTracks, TrackLabel, Tracks
+from uni4d_fg.frontend.sequence.frames import no_masks
+from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
+from uni4d_fg.frontend.tracks.labels import label_tracks
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.runners import stage_runner
+from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom
+from uni4d_fg.slam.stages.scene import Cameras
+from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 
 
 @dataclass(frozen=True)
@@ -74,45 +71,16 @@ def solve_cameras(
         SolverError: If a solve fails.
         Cancelled: If ``should_stop`` said so.
     """
-    run = stage_runner(config)
     hooks = Hooks(should_stop=should_stop) if should_stop is not None else None
-    unsquared = config.energy == "unsquared"
-    start = initialize_cameras(
-        labelled,
-        intrinsics,
-        config.camera_init,
-        free_intrinsics=free_intrinsics and config.camera_init.free_intrinsics,
-        unsquared=unsquared,
-        normalization=config.normalization,
-        hooks=hooks,
-        run=run,
-    )
+    solver = StaticSceneSolver(config, stage_runner(config), hooks, observations_per_frame)
+    start = solver.initialize(labelled, intrinsics, free_intrinsics=free_intrinsics)
     _raise_if_cancelled(start.windows)
-    no_scale = np.zeros(labelled.tracks.num_frames)
-    observations = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
-    wanted = observations_per_frame * labelled.tracks.num_frames
-    if len(observations) > wanted:
-        chosen, _ = observations.rows()
-        chosen = chosen[np.linspace(0, len(chosen) - 1, max(1, len(chosen) * wanted // len(observations))).astype(int)]
-        observations = observations.select(np.isin(observations.track, chosen))
-    observations = weigh_by_drift(observations, labelled.tracks.query_frame, config.bundle_adjustment.drift_frames)
     try:
-        result = adjust_bundle(
-            observations,
-            start.world_T_cam,
-            start.intrinsics,
-            intrinsics,
-            config.bundle_adjustment,
-            Freedom(poses=True, intrinsics=free_intrinsics),
-            unsquared=unsquared,
-            normalization=config.normalization,
-            hooks=hooks,
-            run=run,
-        )
+        scene = solver.adjust(labelled, start.cameras, intrinsics, Freedom(poses=True, intrinsics=free_intrinsics))
     except DegenerateProblemError:  # Stage 1 stands without landmarks.
-        return Cameras(start.world_T_cam, start.intrinsics, no_scale)
-    _raise_if_cancelled(result.solves)
-    return Cameras(result.world_T_cam, result.intrinsics, result.log_scale)
+        return start.cameras
+    _raise_if_cancelled(scene.solves)
+    return scene.cameras
 
 
 def _raise_if_cancelled(solves: list[SolveSummary]) -> None:

@@ -20,25 +20,11 @@ import numpy.typing as npt
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, evenly_spread
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
-from uni4d_fg.tracks.model import LabelledTracks
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.slam.stages.scene import Cameras
 
-_SIGMA_WITHOUT_DEPTH = 1.5
 _MEDIAN_OF_CHI2 = 1.386
-_SHARED_PRIOR = 1e-3
-_MIN_TRACKS = 30
-_MAX_SHARED_TRACKS = 800
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """Poses, intrinsics and depth scales of a video."""
-
-    world_T_cam: FloatArray
-    """(T, 4, 4)."""
-    intrinsics: FloatArray
-    """(4,) px."""
-    log_scale: FloatArray
-    """(T,) the depth cue of frame t times ``exp`` of this agrees with the poses."""
+"""With two degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -145,10 +131,10 @@ def _test_pair(
     pose = relative_pose(cameras.world_T_cam, source, target)
     static = predict_static(uv[:, 0], uv[:, 1], log_depth, pose, cameras.intrinsics)
     residual = uv_target - np.stack((static.u, static.v), axis=1)
-    sigma_depth = np.where(known, config.depth_sigma + 0.5 * spread[seen, source], _SIGMA_WITHOUT_DEPTH)
+    sigma_depth = np.where(known, config.depth_sigma + 0.5 * spread[seen, source], config.depthless_sigma)
     du, dv = static.du * sigma_depth, static.dv * sigma_depth
     variance = (config.track_sigma_px**2 + du * du, du * dv, config.track_sigma_px**2 + dv * dv)
-    error = _fit_shared(uv, residual, variance, image_size)
+    error = _fit_shared(uv, residual, variance, image_size, config)
     if error is not None:
         residual -= np.stack(error.at(uv[:, 0], uv[:, 1]), axis=1)
     squared = mahalanobis(residual[:, 0], residual[:, 1], *variance)
@@ -172,12 +158,16 @@ def _quadratic(x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> tupl
 
 
 def _fit_shared(
-    uv: FloatArray, residual: FloatArray, variance: tuple[FloatArray, FloatArray, FloatArray], size: tuple[int, int]
+    uv: FloatArray,
+    residual: FloatArray,
+    variance: tuple[FloatArray, FloatArray, FloatArray],
+    size: tuple[int, int],
+    config: MotionMaskConfig,
 ) -> SharedError | None:
     """Fit a quadratic to residuals (n, 2) by iteratively reweighted least squares; None with too few."""
-    if len(uv) < _MIN_TRACKS:
+    if len(uv) < config.shared_min_tracks:
         return None
-    thin = evenly_spread(len(uv), _MAX_SHARED_TRACKS)
+    thin = evenly_spread(len(uv), config.shared_max_tracks)
     height, width = size
     terms = np.stack(
         _quadratic((uv[thin, 0] - width / 2) / width, (uv[thin, 1] - height / 2) / width), axis=1
@@ -188,7 +178,7 @@ def _fit_shared(
     coefficients: FloatArray = np.zeros((6, 2))
     for _ in range(8):
         normal = (terms * weight[:, None]).T @ terms
-        normal += _SHARED_PRIOR * weight.sum() * np.eye(6)
+        normal += config.shared_prior * weight.sum() * np.eye(6)
         coefficients = np.asarray(np.linalg.solve(normal, (terms * weight[:, None]).T @ chosen), np.float64)
         miss = np.linalg.norm(chosen - terms @ coefficients, axis=1) * inverse
         scale = max(1.5 * 1.4826 * float(np.median(miss)), 1e-6)

@@ -1,11 +1,22 @@
-"""One file per energy term: its formula, its residual on arrays, its analytic Jacobian.
+"""The language: variable types, factor types, one file per energy term, robust kernels, batches and states.
 
-Residual functions are pure and batched, and accept NumPy arrays or torch tensors alike, so that
-Levenberg-Marquardt, the Adam baseline and the exact scorer evaluate one and the same function.
+Residuals are pure and batched, and take NumPy arrays or torch tensors alike, so that Levenberg-Marquardt, the Adam
+baseline and the exact energy evaluate one and the same function.
 """
 
 from uni4d_fg.factors.batch import FactorBatch, Slot
-from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.factor_type import FactorType, factor, factor_types
 from uni4d_fg.factors.kernels import Kernel
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable import VariableType
 
-__all__ = ["FactorBatch", "FactorFamily", "Kernel", "Slot"]
+__all__ = [
+    "FactorBatch",
+    "FactorType",
+    "Kernel",
+    "Slot",
+    "State",
+    "VariableType",
+    "factor",
+    "factor_types",
+]

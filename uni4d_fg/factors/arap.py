@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
-from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.factor_type import factor
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT
 
 DISTANCE_EPSILON = 1e-4
 """Smoothing of the distance, m."""
@@ -24,12 +25,14 @@ def smooth_distance(p: Array, q: Array) -> Array:
     return xp.sqrt(xp.sum(d * d, axis=-1) + DISTANCE_EPSILON**2)
 
 
-def residual(first: Array, second: Array, first_next: Array, second_next: Array) -> Array:
+@factor(DYNAMIC_POINT, DYNAMIC_POINT, DYNAMIC_POINT, DYNAMIC_POINT, dim=1, stack=0)
+def arap(first: Array, second: Array, first_next: Array, second_next: Array) -> Array:
     """Return (N, 1) m of p_{k,t}, p_{m,t}, p_{k,t+1}, p_{m,t+1}, each (N, 3)."""
     return (smooth_distance(first, second) - smooth_distance(first_next, second_next))[..., None]
 
 
-def linearize(
+@arap.jacobian
+def arap_jacobian(
     first: FloatArray, second: FloatArray, first_next: FloatArray, second_next: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and the four Jacobians, each (N, 1, 3)."""
@@ -38,13 +41,3 @@ def linearize(
     direction_after = ((first_next - second_next) / after[:, None])[:, None, :]
     r: FloatArray = np.asarray(now - after)[:, None]
     return r, [direction_now, -direction_now, -direction_after, direction_after]
-
-
-ARAP = FactorFamily(
-    name="arap",
-    variables=("dynamic_point",) * 4,
-    data=(),
-    residual_dim=1,
-    residual=residual,
-    linearize=linearize,
-)

@@ -1,4 +1,4 @@
-"""Many factors of one family at once: which variables each row reads, its data, noise and kernel."""
+"""Many factors of one type at once: which variables each row reads, its data, noise and kernel."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.errors import SolverError
-from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.factor_type import FactorType
 from uni4d_fg.factors.kernels import Kernel
-from uni4d_fg.graph.keys import decode
-from uni4d_fg.graph.state import TANGENT_DIM, State
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable import VariableType
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One argument of a factor: the group it reads and the row of each of the N factors."""
+    """One argument of a factor: the variable type it reads and the row of each of the N factors."""
 
-    group: str
+    variable: VariableType
     rows: IntArray  # (N,)
 
 
 @dataclass(frozen=True)
 class FactorBatch:
-    """N factors of one family. The energy is ``sum_n weight_n rho(|r_n / sigma_n|)``.
+    """N factors of one type. The energy is ``sum_n weight_n rho(|r_n / sigma_n|)``.
 
     Raises:
         SolverError: On construction, if an array's length differs from N, naming the term and the array.
     """
 
-    family: FactorFamily
+    factor_type: FactorType
     slots: tuple[Slot, ...]
     data: Mapping[str, FloatArray]
     sigma: FloatArray
@@ -40,25 +40,25 @@ class FactorBatch:
     """(N,) non-negative factor on the row's energy."""
     kernel: Kernel
     term: str = ""
-    """Name in summaries; the family's name when empty."""
+    """Name in summaries; the type's own when empty."""
 
     def __post_init__(self) -> None:
         n = len(self.slots[0].rows)
-        if len(self.slots) != len(self.family.variables):
-            raise SolverError(f"{self.name}: {len(self.slots)} slots for {len(self.family.variables)} variables")
-        lengths = {f"slot {s.group}": len(s.rows) for s in self.slots}
+        if len(self.slots) != len(self.factor_type.variables):
+            raise SolverError(f"{self.name}: {len(self.slots)} slots for {len(self.factor_type.variables)} variables")
+        lengths = {f"slot {s.variable}": len(s.rows) for s in self.slots}
         lengths |= {f"data {name}": len(array) for name, array in self.data.items()}
         lengths |= {"sigma": len(self.sigma), "weight": len(self.weight)}
         wrong = {name: length for name, length in lengths.items() if length != n}
         if wrong:
             raise SolverError(f"{self.name}: every array needs {n} rows, got {wrong}")
-        if set(self.data) != set(self.family.data):
-            raise SolverError(f"{self.name}: needs data {self.family.data}, got {tuple(self.data)}")
+        if set(self.data) != set(self.factor_type.data):
+            raise SolverError(f"{self.name}: needs data {self.factor_type.data}, got {tuple(self.data)}")
 
     @classmethod
     def create(
         cls,
-        family: FactorFamily,
+        factor_type: FactorType,
         slots: tuple[Slot, ...],
         data: Mapping[str, FloatArray] | None = None,
         *,
@@ -70,22 +70,25 @@ class FactorBatch:
         """Build a batch, broadcasting scalar ``sigma`` and ``weight`` to all rows.
 
         Raises:
-            SolverError: If a sigma is not positive, a weight is negative or a row is not a row of its group.
+            SolverError: If a sigma is not positive, a weight or a row is negative, or a datum has another shape.
         """
         n = len(slots[0].rows)
         sigma_array = np.broadcast_to(np.asarray(sigma, dtype=np.float64), np.shape(sigma) or (n,))
         weight_array = np.broadcast_to(np.asarray(weight, dtype=np.float64), (n,))
-        name = term or family.name
+        name = term or factor_type.term
         if not (np.isfinite(sigma_array) & (sigma_array > 0)).all():
             raise SolverError(f"{name}: every sigma must be finite and positive")
         if not (np.isfinite(weight_array) & (weight_array >= 0)).all():
             raise SolverError(f"{name}: every weight must be finite and not negative")
-        for slot, group in zip(slots, family.variables, strict=False):
-            if slot.group != group:
-                raise SolverError(f"{name}: a slot reads {slot.group} where the family needs {group}")
+        for slot, variable in zip(slots, factor_type.variables, strict=False):
+            if slot.variable is not variable:
+                raise SolverError(f"{name}: a slot reads {slot.variable} where the factor needs {variable}")
             if len(slot.rows) and slot.rows.min() < 0:
-                raise SolverError(f"{name}: a row of {group} is negative")
-        return cls(family, slots, data or {}, sigma_array, weight_array, kernel or Kernel(), term)
+                raise SolverError(f"{name}: a row of {variable} is negative")
+        for key, array in (data or {}).items():
+            if key in factor_type.data and array.shape[1:] != factor_type.data[key]:
+                raise SolverError(f"{name}: {key} has rows of shape {array.shape[1:]}, not {factor_type.data[key]}")
+        return cls(factor_type, slots, data or {}, sigma_array, weight_array, kernel or Kernel(), term)
 
     def __len__(self) -> int:
         return len(self.slots[0].rows)
@@ -93,13 +96,13 @@ class FactorBatch:
     @property
     def name(self) -> str:
         """Name of the term in summaries and messages."""
-        return self.term or self.family.name
+        return self.term or self.factor_type.term
 
     def take(self, rows: IntArray) -> FactorBatch:
         """Return the batch with the given rows, in the given order."""
         return replace(
             self,
-            slots=tuple(Slot(s.group, s.rows[rows]) for s in self.slots),
+            slots=tuple(Slot(s.variable, s.rows[rows]) for s in self.slots),
             data={name: array[rows] for name, array in self.data.items()},
             sigma=self.sigma[rows],
             weight=self.weight[rows],
@@ -107,11 +110,11 @@ class FactorBatch:
 
     def gather(self, state: State) -> list[FloatArray]:
         """Return the variables of every row, one array per slot."""
-        return [np.take(state[s.group], s.rows, axis=0) for s in self.slots]
+        return [np.take(state[s.variable], s.rows, axis=0) for s in self.slots]
 
     def residual(self, state: State) -> FloatArray:
         """Return the raw residuals (N, d)."""
-        result: FloatArray = self.family.residual(*self.gather(state), **self.data)
+        result: FloatArray = self.factor_type.residual(*self.gather(state), **self.data)
         return result
 
     def _inverse_sigma(self) -> FloatArray:
@@ -123,12 +126,18 @@ class FactorBatch:
         result: FloatArray = np.einsum("nd,nd->n", whitened, whitened)
         return result
 
-    def energy(self, state: State) -> float:
-        """Return ``sum_n weight_n rho(|r_n / sigma_n|)``."""
+    def energy(self, state: State, *, exact: bool = False) -> float:
+        """Return ``sum_n weight_n rho(|r_n / sigma_n|)``.
+
+        Args:
+            state: Where.
+            exact: Without the smoothing of 'norm' kernels, which is a solver's aid.
+        """
         if len(self) == 0:
             return 0.0
+        squared = self.squared_norm(state)
         # Not np.dot: BLAS may spread it over threads, which costs more than it gains and changes the rounding.
-        return float(np.sum(self.weight * self.kernel.rho(self.squared_norm(state))))
+        return float(np.sum(self.weight * (self.kernel.exact(squared) if exact else self.kernel.rho(squared))))
 
     def linearize(self, state: State, kernel_curvature: float = 0.0) -> tuple[FloatArray, list[FloatArray]]:
         """Return residuals (N, d) and Jacobians (N, d, dim) with noise, weight and kernel applied.
@@ -141,7 +150,7 @@ class FactorBatch:
         Raises:
             SolverError: If a Jacobian has the wrong shape or anything is not finite; names the variables.
         """
-        r, jacobians = self.family.linearize(*self.gather(state), **self.data)
+        r, jacobians = self.factor_type.linearize(*self.gather(state), **self.data)
         self.check(r, jacobians, state)
         inverse_sigma = self._inverse_sigma()
         r = r * inverse_sigma
@@ -159,18 +168,18 @@ class FactorBatch:
         return r * scale[:, None], jacobians
 
     def check(self, r: FloatArray, jacobians: list[FloatArray], state: State) -> None:
-        """Check what the family's ``linearize`` returned; ``state`` names the variables.
+        """Check what the type's ``linearize`` returned; ``state`` names the variables.
 
         Raises:
             SolverError: If a shape is wrong or a value is not finite.
         """
-        n, d = len(self), self.family.residual_dim
+        n, d = len(self), self.factor_type.dim
         if len(jacobians) != len(self.slots):
             raise SolverError(f"{self.name}: {len(jacobians)} Jacobians for {len(self.slots)} variables")
         for slot, jacobian in zip(self.slots, jacobians, strict=True):
-            expected = (n, d, TANGENT_DIM[slot.group])
+            expected = (n, d, slot.variable.dim)
             if jacobian.shape != expected:
-                raise SolverError(f"{self.name}: Jacobian of {slot.group} is {jacobian.shape}, not {expected}")
+                raise SolverError(f"{self.name}: Jacobian of {slot.variable} is {jacobian.shape}, not {expected}")
         if r.shape != (n, d):
             raise SolverError(f"{self.name}: residual is {r.shape}, not {(n, d)}")
         # A sum is finite only if every entry is: one cheap pass in the usual case.
@@ -189,4 +198,4 @@ class FactorBatch:
 
     def describe_row(self, row: int, state: State) -> str:
         """Return the decoded variables of one factor: "camera pose, frame 3 and landmark, track 17"."""
-        return " and ".join(str(decode(state.key(s.group, int(s.rows[row])))) for s in self.slots)
+        return " and ".join(state.describe(s.variable, int(s.rows[row])) for s in self.slots)

@@ -16,34 +16,9 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
-from uni4d_fg.factors.family import FactorFamily
-from uni4d_fg.geometry.se3 import skew
-
-
-def rotation_log(rotation: Array) -> Array:
-    """Return rotation vectors (N, 3), rad, of matrices (N, 3, 3), differentiable at the identity."""
-    xp = namespace(rotation)
-    axis = 0.5 * xp.stack(
-        (
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ),
-        axis=-1,
-    )
-    squared_sine = xp.sum(axis * axis, axis=-1)
-    small = squared_sine < 1e-14
-    sine = xp.sqrt(xp.where(small, 1.0 + 0.0 * squared_sine, squared_sine))
-    cosine = 0.5 * (rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2] - 1.0)
-    factor = xp.where(small, 1.0 + squared_sine / 6.0, xp.atan2(sine, cosine) / sine)
-    return factor[..., None] * axis
-
-
-def _relative_rotation(first: Array, second: Array) -> Array:
-    """Return R_first^T R_second, (N, 3, 3)."""
-    a, b = first[..., :3, :3], second[..., :3, :3]
-    xp = namespace(a)
-    return xp.sum(a[..., :, :, None] * b[..., :, None, :], axis=-3)
+from uni4d_fg.factors.factor_type import factor
+from uni4d_fg.factors.variable_types import POSE
+from uni4d_fg.geometry.se3 import relative_rotation, rotation_log, so3_inverse_right_jacobian
 
 
 def _relative_change(a: Array, b: Array, floor: Array) -> Array:
@@ -53,14 +28,16 @@ def _relative_change(a: Array, b: Array, floor: Array) -> Array:
     return (a - b) / (0.5 * (norm_a + norm_b))[..., None]
 
 
-def rotation_residual(before: Array, now: Array, after: Array, *, floor: Array) -> Array:
+@factor(POSE, POSE, POSE, data={"floor": ()}, dim=3)
+def camera_rotation(before: Array, now: Array, after: Array, *, floor: Array) -> Array:
     """Return (N, 3) of three poses (N, 4, 4) and the floor (N,), rad."""
-    a = rotation_log(_relative_rotation(before, now))
-    b = rotation_log(_relative_rotation(now, after))
+    a = rotation_log(relative_rotation(before, now))
+    b = rotation_log(relative_rotation(now, after))
     return _relative_change(a, b, floor)
 
 
-def translation_residual(before: Array, now: Array, after: Array, *, floor: Array) -> Array:
+@factor(POSE, POSE, POSE, data={"floor": ()}, dim=3)
+def camera_translation(before: Array, now: Array, after: Array, *, floor: Array) -> Array:
     """Return (N, 3) of three poses (N, 4, 4) and the floor (N,), m."""
     a = now[..., :3, 3] - before[..., :3, 3]
     b = after[..., :3, 3] - now[..., :3, 3]
@@ -81,25 +58,15 @@ def _relative_change_derivatives(
     return r, by_a, by_b
 
 
-def _inverse_right_jacobian(omega: FloatArray) -> FloatArray:
-    """Return Jr^{-1} with Log(Exp(omega) Exp(d)) = omega + Jr^{-1} d, (N, 3, 3)."""
-    angle = np.linalg.norm(omega, axis=-1)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    coefficient = np.where(small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
-    w = skew(omega)
-    result: FloatArray = np.eye(3) + 0.5 * w + coefficient[:, None, None] * (w @ w)
-    return result
-
-
-def rotation_linearize(
+@camera_rotation.jacobian
+def camera_rotation_jacobian(
     before: FloatArray, now: FloatArray, after: FloatArray, *, floor: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and the Jacobians of the three poses, each (N, 3, 6)."""
-    a = rotation_log(_relative_rotation(before, now))
-    b = rotation_log(_relative_rotation(now, after))
+    a = rotation_log(relative_rotation(before, now))
+    b = rotation_log(relative_rotation(now, after))
     r, by_a, by_b = _relative_change_derivatives(a, b, floor)
-    right_a, right_b = _inverse_right_jacobian(a), _inverse_right_jacobian(b)
+    right_a, right_b = so3_inverse_right_jacobian(a), so3_inverse_right_jacobian(b)
     # The left Jacobian's inverse is the transpose of the right one's.
     left_a, left_b = np.swapaxes(right_a, 1, 2), np.swapaxes(right_b, 1, 2)
     jacobians = [np.zeros((len(a), 3, 6)) for _ in range(3)]
@@ -109,7 +76,8 @@ def rotation_linearize(
     return r, jacobians
 
 
-def translation_linearize(
+@camera_translation.jacobian
+def camera_translation_jacobian(
     before: FloatArray, now: FloatArray, after: FloatArray, *, floor: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and the Jacobians of the three poses, each (N, 3, 6)."""
@@ -121,22 +89,3 @@ def translation_linearize(
     jacobians[1][:, :, 3:] = (by_a - by_b) @ now[:, :3, :3]
     jacobians[2][:, :, 3:] = by_b @ after[:, :3, :3]
     return r, jacobians
-
-
-CAMERA_ROTATION = FactorFamily(
-    name="camera_rotation",
-    variables=("pose",) * 3,
-    data=("floor",),
-    residual_dim=3,
-    residual=rotation_residual,
-    linearize=rotation_linearize,
-)
-
-CAMERA_TRANSLATION = FactorFamily(
-    name="camera_translation",
-    variables=("pose",) * 3,
-    data=("floor",),
-    residual_dim=3,
-    residual=translation_residual,
-    linearize=translation_linearize,
-)

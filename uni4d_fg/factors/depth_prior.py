@@ -4,7 +4,7 @@ r"""Depth prior: a point's depth agrees with the depth cue up to one log-scale p
 
 ``depth`` is the cue at the observation (metres), ``log_scale`` the frame's s_t: the cue is too small by the
 factor exp(s_t). Below the near plane log is continued by its tangent, so that a point behind the camera is
-pushed forward. Two families: one on pose, landmark and log-scale (stage 2), one on a dynamic point with
+pushed forward. Two types: one on pose, landmark and log-scale (stage 2), one on a dynamic point with
 frozen camera and log-scale (stage 3). Not in the paper: without it the scene may shrink towards the camera
 at no cost.
 """
@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
-from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.factor_type import factor
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 
 
@@ -25,14 +26,16 @@ def log_depth(z: Array) -> Array:
     return xp.log(safe) + xp.where(z >= NEAR_PLANE, 0.0 * z, z / NEAR_PLANE - 1.0)
 
 
-def static_residual(world_T_cam: Array, landmark: Array, log_scale: Array, *, depth: Array) -> Array:
+@factor(POSE, LANDMARK, LOG_SCALE, data={"depth": ()}, dim=1, term="depth_prior", stack=1)
+def static_depth_prior(world_T_cam: Array, landmark: Array, log_scale: Array, *, depth: Array) -> Array:
     """Return (N, 1) of poses (N, 4, 4), landmarks (N, 3), log-scales (N, 1) and cue depths (N,)."""
     xp = namespace(landmark)
     z = world_to_camera(world_T_cam, landmark)[..., 2]
     return (log_depth(z) - xp.log(depth))[..., None] - log_scale
 
 
-def static_linearize(
+@static_depth_prior.jacobian
+def static_depth_prior_jacobian(
     world_T_cam: FloatArray, landmark: FloatArray, log_scale: FloatArray, *, depth: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and Jacobians: pose (N, 1, 6), landmark (N, 1, 3), log-scale (N, 1, 1)."""
@@ -47,33 +50,16 @@ def static_linearize(
     return r, [pose, point, np.full((len(x), 1, 1), -1.0)]
 
 
-def dynamic_residual(dynamic_point: Array, *, depth: Array, world_T_cam: Array, log_scale: Array) -> Array:
+@factor(DYNAMIC_POINT, data={"depth": (), "world_T_cam": (4, 4), "log_scale": ()}, dim=1, term="depth_prior", stack=0)
+def dynamic_depth_prior(dynamic_point: Array, *, depth: Array, world_T_cam: Array, log_scale: Array) -> Array:
     """Return (N, 1) of points (N, 3), cue depths (N,), frozen poses (N, 4, 4) and log-scales (N,)."""
-    return static_residual(world_T_cam, dynamic_point, log_scale[..., None], depth=depth)
+    return static_depth_prior.residual(world_T_cam, dynamic_point, log_scale[..., None], depth=depth)
 
 
-def dynamic_linearize(
+@dynamic_depth_prior.jacobian
+def dynamic_depth_prior_jacobian(
     dynamic_point: FloatArray, *, depth: FloatArray, world_T_cam: FloatArray, log_scale: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and its Jacobian with respect to the point, (N, 1, 3)."""
-    r, (_, point, _) = static_linearize(world_T_cam, dynamic_point, log_scale[:, None], depth=depth)
+    r, (_, point, _) = static_depth_prior_jacobian(world_T_cam, dynamic_point, log_scale[:, None], depth=depth)
     return r, [point]
-
-
-STATIC_DEPTH_PRIOR = FactorFamily(
-    name="depth_prior",
-    variables=("pose", "landmark", "log_scale"),
-    data=("depth",),
-    residual_dim=1,
-    residual=static_residual,
-    linearize=static_linearize,
-)
-
-DYNAMIC_DEPTH_PRIOR = FactorFamily(
-    name="depth_prior",
-    variables=("dynamic_point",),
-    data=("depth", "world_T_cam", "log_scale"),
-    residual_dim=1,
-    residual=dynamic_residual,
-    linearize=dynamic_linearize,
-)

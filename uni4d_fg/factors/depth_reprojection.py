@@ -12,12 +12,14 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray
-from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.factor_type import factor
 from uni4d_fg.factors.projection import chain_to_pose, chain_to_world_point, projection_derivatives
+from uni4d_fg.factors.variable_types import INTRINSICS, POSE
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
 
 
-def residual(
+@factor(POSE, POSE, INTRINSICS, data={"uv_source": 2, "depth": (), "uv_target": 2}, dim=2, stack=(0, 1))
+def depth_reprojection(
     source_pose: Array,
     target_pose: Array,
     intrinsics: Array,
@@ -31,7 +33,8 @@ def residual(
     return uv_target - project(intrinsics, world_to_camera(target_pose, point_world))
 
 
-def linearize(
+@depth_reprojection.jacobian
+def depth_reprojection_jacobian(
     source_pose: FloatArray,
     target_pose: FloatArray,
     intrinsics: FloatArray,
@@ -56,13 +59,3 @@ def linearize(
     by_intrinsics[:, :, 2] -= by_source[:, :, 0] * (depth[:, None] / fx)
     by_intrinsics[:, :, 3] -= by_source[:, :, 1] * (depth[:, None] / fy)
     return uv_target - project(intrinsics, x_target), [-source, -target, -by_intrinsics]
-
-
-DEPTH_REPROJECTION = FactorFamily(
-    name="depth_reprojection",
-    variables=("pose", "pose", "intrinsics"),
-    data=("uv_source", "depth", "uv_target"),
-    residual_dim=2,
-    residual=residual,
-    linearize=linearize,
-)

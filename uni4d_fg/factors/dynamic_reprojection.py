@@ -9,30 +9,23 @@ the frozen ``intrinsics``. Source: Uni4D, non-rigid bundle adjustment term.
 from __future__ import annotations
 
 from uni4d_fg.arrays import Array, FloatArray
-from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.factor_type import factor
 from uni4d_fg.factors.projection import chain_to_world_point, projection_derivatives
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT
 from uni4d_fg.geometry.camera import project, world_to_camera
 
 
-def residual(dynamic_point: Array, *, uv: Array, world_T_cam: Array, intrinsics: Array) -> Array:
+@factor(DYNAMIC_POINT, data={"uv": 2, "world_T_cam": (4, 4), "intrinsics": 4}, dim=2, stack=0)
+def dynamic_reprojection(dynamic_point: Array, *, uv: Array, world_T_cam: Array, intrinsics: Array) -> Array:
     """Return (N, 2) px of points (N, 3), pixels (N, 2), poses (N, 4, 4) and intrinsics (N, 4)."""
     return uv - project(intrinsics, world_to_camera(world_T_cam, dynamic_point))
 
 
-def linearize(
+@dynamic_reprojection.jacobian
+def dynamic_reprojection_jacobian(
     dynamic_point: FloatArray, *, uv: FloatArray, world_T_cam: FloatArray, intrinsics: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and its Jacobian with respect to the point, (N, 2, 3)."""
     x = world_to_camera(world_T_cam, dynamic_point)
     by_x, _ = projection_derivatives(intrinsics, x)
     return uv - project(intrinsics, x), [-chain_to_world_point(by_x, world_T_cam)]
-
-
-DYNAMIC_REPROJECTION = FactorFamily(
-    name="dynamic_reprojection",
-    variables=("dynamic_point",),
-    data=("uv", "world_T_cam", "intrinsics"),
-    residual_dim=2,
-    residual=residual,
-    linearize=linearize,
-)

@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import Array, FloatArray, namespace
 
 KernelKind = Literal["quadratic", "huber", "pseudo_huber", "cauchy", "norm"]
 
@@ -33,21 +33,26 @@ class Kernel:
     kind: KernelKind = "quadratic"
     threshold: float = 1.0
 
-    def rho(self, squared: FloatArray) -> FloatArray:
-        """Evaluate the kernel at squared norms s^2; same shape."""
+    def rho(self, squared: Array) -> Array:
+        """Evaluate the kernel at squared norms s^2, NumPy or torch; same shape, with a finite gradient at zero."""
         c = self.threshold
-        result: FloatArray
         if self.kind == "quadratic":
-            result = 0.5 * squared
-        elif self.kind == "huber":
-            result = np.where(squared <= c * c, 0.5 * squared, c * np.sqrt(squared) - 0.5 * c * c)
-        elif self.kind == "pseudo_huber":
-            result = c * c * _sqrt1p_minus1(squared / (c * c))
-        elif self.kind == "cauchy":
-            result = 0.5 * c * c * np.log1p(squared / (c * c))
-        else:
-            result = c * _sqrt1p_minus1(squared / (c * c))
-        return result
+            return 0.5 * squared
+        xp = namespace(squared)
+        if self.kind == "huber":
+            inside = squared <= c * c
+            # A square root at zero has an infinite slope, which where() would multiply by zero.
+            outside = c * xp.sqrt(xp.where(inside, c * c + 0.0 * squared, squared)) - 0.5 * c * c
+            return xp.where(inside, 0.5 * squared, outside)
+        x = squared / (c * c)
+        if self.kind == "cauchy":
+            return 0.5 * c * c * xp.log1p(x)
+        root = x / (xp.sqrt(1.0 + x) + 1.0)  # sqrt(1 + x) - 1 without cancellation
+        return (c * c if self.kind == "pseudo_huber" else c) * root
+
+    def exact(self, squared: Array) -> Array:
+        """Evaluate the kernel that is meant: 'norm' is the Euclidean norm itself, without a solver's smoothing."""
+        return namespace(squared).sqrt(squared) if self.kind == "norm" else self.rho(squared)
 
     def weight(self, squared: FloatArray) -> FloatArray:
         """Evaluate the weight rho'(s)/s at squared norms s^2; same shape, finite at zero."""
@@ -106,9 +111,3 @@ class Kernel:
         # a^2 = 2 rho / s^2  =>  a a' = rho'/s^2 - 2 rho/s^3, so a'/s = (w - a^2) / (a s^2)
         slope = np.where(squared < 1e-12, 0.0, (self.weight(safe) - a * a) / (a * safe))
         return a, slope
-
-
-def _sqrt1p_minus1(x: FloatArray) -> FloatArray:
-    """Return sqrt(1 + x) - 1 without cancellation for small x >= 0."""
-    result: FloatArray = x / (np.sqrt(1.0 + x) + 1.0)
-    return result

@@ -2,32 +2,67 @@ r"""Priors that anchor what the images leave free.
 
 intrinsics   r = K - K_0                                [px], 4-vector
 log-scale    r = s_t - s_0                              [dimensionless], 1-vector
+aspect       r = log(fx / fy) - log(fx_0 / fy_0)        [dimensionless], 1-vector: the shape of a pixel
 scale        r = log(|c_a - c_b| / distance)            [dimensionless], 1-vector: fixes the scale of a
 reconstruction that no depth prior holds
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import gtsam
 import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
-from uni4d_fg.factors.family import FactorFamily
+from uni4d_fg.factors.factor_type import NativeRow, factor
+from uni4d_fg.factors.variable_types import CALIBRATION_COLUMNS, INTRINSICS, LOG_SCALE, POSE, calibration
 
 _MIN_DISTANCE = 1e-9
+_LOOSE = 1e9
+"""Sigma of the skew, which ours leaves alone."""
 
 
-def difference_residual(variable: Array, *, measured: Array) -> Array:
-    """Return variable - measured, (N, d)."""
-    return variable - measured
-
-
-def difference_linearize(variable: FloatArray, *, measured: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+def difference_jacobian(variable: FloatArray, *, measured: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and its Jacobian, the identity (N, d, d)."""
     n, d = variable.shape
     return variable - measured, [np.broadcast_to(np.eye(d), (n, d, d))]
 
 
-def scale_residual(first: Array, second: Array, *, distance: Array) -> Array:
+def native_intrinsics(row: NativeRow) -> Any:
+    """Return GTSAM's prior on a pinhole, with a loose skew."""
+    if row.is_robust:  # a kernel would see the skew's entry as well
+        return None
+    sigma = np.full(5, _LOOSE)
+    sigma[list(CALIBRATION_COLUMNS)] = row.noise.sigmas()
+    return gtsam.PriorFactorCal3_S2(
+        row.keys[0], calibration(row.data["measured"]), gtsam.noiseModel.Diagonal.Sigmas(sigma)
+    )
+
+
+def native_log_scale(row: NativeRow) -> Any:
+    """Return GTSAM's prior on a vector."""
+    return gtsam.PriorFactorVector(row.keys[0], row.data["measured"], row.noise)
+
+
+@factor(INTRINSICS, data={"measured": 4}, dim=4, native=native_intrinsics)
+def intrinsics_prior(intrinsics: Array, *, measured: Array) -> Array:
+    """Return intrinsics - measured, (N, 4) px."""
+    return intrinsics - measured
+
+
+@factor(LOG_SCALE, data={"measured": 1}, dim=1, native=native_log_scale)
+def log_scale_prior(log_scale: Array, *, measured: Array) -> Array:
+    """Return log_scale - measured, (N, 1)."""
+    return log_scale - measured
+
+
+intrinsics_prior.jacobian(difference_jacobian)
+log_scale_prior.jacobian(difference_jacobian)
+
+
+@factor(POSE, POSE, data={"distance": ()}, dim=1)
+def scale_anchor(first: Array, second: Array, *, distance: Array) -> Array:
     """Return (N, 1) of two poses (N, 4, 4) and the distance of their centres (N,), m."""
     xp = namespace(first)
     d = second[..., :3, 3] - first[..., :3, 3]
@@ -35,7 +70,8 @@ def scale_residual(first: Array, second: Array, *, distance: Array) -> Array:
     return xp.log(length / distance)[..., None]
 
 
-def scale_linearize(
+@scale_anchor.jacobian
+def scale_anchor_jacobian(
     first: FloatArray, second: FloatArray, *, distance: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and the Jacobians of both poses, each (N, 1, 6)."""
@@ -48,52 +84,17 @@ def scale_linearize(
     return (0.5 * np.log(squared) - np.log(distance))[:, None], jacobians
 
 
-def aspect_residual(intrinsics: Array, *, measured: Array) -> Array:
+@factor(INTRINSICS, data={"measured": ()}, dim=1)
+def aspect_prior(intrinsics: Array, *, measured: Array) -> Array:
     """Return (N, 1) of intrinsics (N, 4) and the measured log(fx / fy) (N,)."""
     xp = namespace(intrinsics)
     return (xp.log(intrinsics[..., 0]) - xp.log(intrinsics[..., 1]) - measured)[..., None]
 
 
-def aspect_linearize(intrinsics: FloatArray, *, measured: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+@aspect_prior.jacobian
+def aspect_prior_jacobian(intrinsics: FloatArray, *, measured: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and its Jacobian (N, 1, 4)."""
     jacobian = np.zeros((len(intrinsics), 1, 4))
     jacobian[:, 0, 0] = 1.0 / intrinsics[:, 0]
     jacobian[:, 0, 1] = -1.0 / intrinsics[:, 1]
-    return aspect_residual(intrinsics, measured=measured), [jacobian]
-
-
-ASPECT_PRIOR = FactorFamily(
-    name="aspect_prior",
-    variables=("intrinsics",),
-    data=("measured",),
-    residual_dim=1,
-    residual=aspect_residual,
-    linearize=aspect_linearize,
-)
-
-INTRINSICS_PRIOR = FactorFamily(
-    name="intrinsics_prior",
-    variables=("intrinsics",),
-    data=("measured",),
-    residual_dim=4,
-    residual=difference_residual,
-    linearize=difference_linearize,
-)
-
-LOG_SCALE_PRIOR = FactorFamily(
-    name="log_scale_prior",
-    variables=("log_scale",),
-    data=("measured",),
-    residual_dim=1,
-    residual=difference_residual,
-    linearize=difference_linearize,
-)
-
-SCALE_ANCHOR = FactorFamily(
-    name="scale_anchor",
-    variables=("pose", "pose"),
-    data=("distance",),
-    residual_dim=1,
-    residual=scale_residual,
-    linearize=scale_linearize,
-)
+    return aspect_prior.residual(intrinsics, measured=measured), [jacobian]

@@ -1,1 +1,1 @@
-"""Rigid transforms, the pinhole camera and trajectory alignment."""
+"""Rigid transforms, the pinhole camera and the alignment of trajectories; arrays in, arrays out."""

@@ -10,19 +10,19 @@ import numpy as np
 from uni4d_fg.arrays import ImageArray, Int32Array
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
-from uni4d_fg.evaluate.trajectory import Trajectory
-from uni4d_fg.evaluate.tum import write_tum
-from uni4d_fg.fusion.clouds import dynamic_cloud, dynamic_clouds, static_cloud
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.pipeline.leftovers import remove_views
 from uni4d_fg.pipeline.steps import Arrays
-from uni4d_fg.reconstruction.clouds import write_clouds
-from uni4d_fg.reconstruction.depth_store import read_depth
-from uni4d_fg.reconstruction.io import save_reconstruction
-from uni4d_fg.reconstruction.model import Reconstruction
-from uni4d_fg.reconstruction.pictures import draw_depth_strip, draw_scene, draw_trajectory
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.tracks.model import LabelledTracks
+from uni4d_fg.results.clouds import write_clouds
+from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.evaluate.trajectory import Trajectory
+from uni4d_fg.results.evaluate.tum import write_tum
+from uni4d_fg.results.fusion.clouds import dynamic_cloud, dynamic_clouds, static_cloud
+from uni4d_fg.results.io import save_reconstruction
+from uni4d_fg.results.pictures import draw_depth_strip, draw_scene, draw_trajectory
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.reconstruction import OBJECT_ARRAYS, Reconstruction
 
 ValueT = TypeVar("ValueT")
 
@@ -49,6 +49,7 @@ def assemble(sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion
         dynamic_color=colors[len(landmark_track) :],
         pose_covariance=scene.get("pose_covariance"),
         intrinsics_covariance=scene.get("intrinsics_covariance"),
+        **{name: motion[name] for name in OBJECT_ARRAYS if name in motion},
     )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.sequence.problems import SequenceProblem, some_of
-from uni4d_fg.sequence.selection import MIN_FRAMES
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
+from uni4d_fg.frontend.sequence.selection import MIN_FRAMES
 
 _MAX_ROTATION_ERROR = 1e-6
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.model import Sequence
 
 ALGORITHM_VERSION = 2
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""

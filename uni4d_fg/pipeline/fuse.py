@@ -11,14 +11,14 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
-from uni4d_fg.fusion.averaging import average_over_frames
-from uni4d_fg.fusion.densify import ControlPoints, densify_frame
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.progress import Reporter
-from uni4d_fg.reconstruction.depth_store import write_depth
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.tracks.model import LabelledTracks
+from uni4d_fg.results.depth_store import write_depth
+from uni4d_fg.results.fusion.averaging import average_over_frames
+from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
 
 
 def fuse_depth(

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from uni4d_fg.files import write_failure
-from uni4d_fg.reconstruction.run_folder import RunFolder
+from uni4d_fg.results.run_folder import RunFolder
 
 _TEMPORARY = re.compile(r"\.tmp-[0-9a-f]{8}-(?P<name>.+)")
 
@@ -20,7 +20,7 @@ def remove_leftovers(folder: RunFolder) -> None:
     results = (folder.reconstruction, folder.trajectory, folder.depth, folder.summary, folder.config, folder.labels)
     names = {path.name for path in results}
     stages, clouds, pictures = folder.root / "stages", folder.static_cloud.parent, folder.trajectory_picture.parent
-    for parent in (folder.root, stages, clouds, folder.dynamic_cloud(0).parent, pictures):
+    for parent in (folder.root, stages, folder.graphs, clouds, folder.dynamic_cloud(0).parent, pictures):
         for path in parent.glob(".tmp-*") if parent.is_dir() else ():
             temporary = _TEMPORARY.fullmatch(path.name)
             ours = temporary is not None and (parent != folder.root or temporary["name"] in names)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,29 +12,34 @@ import numpy as np
 
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
+from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.frontend.tracks.cache import load_or_track
+from uni4d_fg.frontend.tracks.labels import label_tracks
+from uni4d_fg.optim.added_factors import FactorSource, with_additions
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.problem_io import save_stage_graph
+from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
+from uni4d_fg.optim.stage import StageRunner
+from uni4d_fg.optim.stage_graph import RecordingRunner
 from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
+from uni4d_fg.pipeline.graphs import remove_graphs, write_graph_values
 from uni4d_fg.pipeline.leftovers import remove_leftovers
-from uni4d_fg.pipeline.solver import solver_facts, solver_settings, stage_runner
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.progress import Reporter, SilentReporter
-from uni4d_fg.reconstruction.depth_store import read_depth
-from uni4d_fg.reconstruction.labels_io import load_labels, save_labels
-from uni4d_fg.reconstruction.run_folder import RunFolder
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.stages.stage import StageRunner
-from uni4d_fg.tracks.cache import load_or_track
-from uni4d_fg.tracks.labels import label_tracks
-from uni4d_fg.tracks.model import LabelledTracks
-from uni4d_fg.windows.plan import Window, windows_of
+from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.labels_io import load_labels, save_labels
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.windows.plan import Window, windows_of
 
 ValueT = TypeVar("ValueT")
 
@@ -51,6 +56,7 @@ class _Run:
     reporter: Reporter
     should_stop: Callable[[], bool]
     summary: RunSummary
+    recorder: RecordingRunner
 
     def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord]) -> Arrays:
         """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored."""
@@ -61,6 +67,8 @@ class _Run:
             self._check_cancelled()
             # A step may write files besides its record: an old record must not vouch for half-new ones.
             self.store.discard(name)
+            remove_graphs(self.folder, name)
+            self.recorder.solved.clear()
             self.reporter.begin(name.replace("_", " "), None)
             counter = iter(range(1, 1 << 30))
             hooks = Hooks(
@@ -70,6 +78,8 @@ class _Run:
                 should_stop=self.should_stop,
             )
             record = compute(hooks)
+            for kind, solved in self.recorder.solved.items():
+                save_stage_graph(self.folder.graph(kind), solved)
             self.store.save(name, key, record)
             self.reporter.end()
         self._note(name, record.summary, time.perf_counter() - began, resumed)
@@ -101,6 +111,7 @@ def reconstruct(
     reporter: Reporter | None = None,
     should_stop: Callable[[], bool] | None = None,
     cues: dict[str, Any] | None = None,
+    additions: Iterable[FactorSource] = (),
 ) -> RunSummary:
     """Reconstruct a sequence and write the run folder.
 
@@ -112,6 +123,8 @@ def reconstruct(
         reporter: Progress.
         should_stop: Polled often; True ends the run with :class:`Cancelled`, finished stages kept.
         cues: What was made of the cues, for the summary: ``sources``, ``facts``, ``warnings``, ``metric``.
+        additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`. They are
+            not part of what ``resume`` compares.
 
     Returns:
         The summary that is also written as ``summary.json``.
@@ -125,7 +138,8 @@ def reconstruct(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
-    run_stage = stage_runner(config)
+    recorder = RecordingRunner(stage_runner(config))
+    run_stage = with_additions(recorder, tuple(additions))
     windows = windows_of(config, sequence.num_frames)
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
@@ -142,7 +156,7 @@ def reconstruct(
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter or SilentReporter(), should_stop or (lambda: False), summary,
+        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder,
     )  # fmt: skip
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
@@ -160,8 +174,9 @@ def reconstruct(
     run.reporter.begin("clouds and pictures", None)
     unit = "m" if summary.cues.get("metric", True) else "scale unknown"
     write_views(folder, sequence, reconstruction, config, run.should_stop, unit=unit)
+    graphs = write_graph_values(folder)
     run.reporter.end()
-    run._note("output", {}, time.perf_counter() - began, False)
+    run._note("output", {"graphs": graphs}, time.perf_counter() - began, False)
     atomic_write_json(folder.summary, summary.to_dict())
     return summary
 
@@ -179,7 +194,7 @@ def _stages(
         key = stage_key(key, config.bundle_adjustment, config.windows)
         before = key
         scene = run.step("bundle_adjustment", key, lambda hooks: scene_step(parts, before, hooks))
-        key = stage_key(key, config.nonrigid)
+        key = stage_key(key, config.nonrigid, *_searched(config))
         after = key
         return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
@@ -189,9 +204,18 @@ def _stages(
         key,
         lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage),
     )
-    key = stage_key(key, config.nonrigid)
-    motion = run.step("nonrigid", key, lambda hooks: nonrigid_step(labelled, scene, config, hooks, run_stage))
+    key = stage_key(key, config.nonrigid, *_searched(config))
+    motion = run.step(
+        "nonrigid",
+        key,
+        lambda hooks: nonrigid_step(labelled, scene, config, hooks, run_stage, sequence.timestamps),
+    )
     return key, scene, motion
+
+
+def _searched(config: Config) -> list[RigidObjectsConfig]:
+    """Return the settings of the search for rigid objects, if there is one: those of none change no result."""
+    return [config.rigid_objects] if config.rigid_objects.enabled else []
 
 
 def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:

@@ -11,29 +11,30 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.energy import static_energy
+from uni4d_fg.config.solver import KernelConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
+from uni4d_fg.factors.variable_types import INTRINSICS
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.stage import StageRunner, run_stage
+from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.pipeline.rigid import rigid_objects_part
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.solve.summary import SolveSummary, Termination
-from uni4d_fg.stages.bundle_adjustment import (
-    BundleAdjustmentResult,
-    Freedom,
-    StaticNoise,
-    adjust_bundle,
-)
-from uni4d_fg.stages.camera_init import initialize_cameras
-from uni4d_fg.stages.local_scale import predict_log_scale
-from uni4d_fg.stages.nonrigid import FrozenCameras, NonRigidResult, solve_nonrigid
-from uni4d_fg.stages.observations import Observations, observations_of, weigh_by_drift
-from uni4d_fg.stages.stage import StageRunner, run_stage
-from uni4d_fg.tracks.model import LabelledTracks, TrackLabel
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
+from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy, energy_of
+from uni4d_fg.slam.stages.local_scale import predict_log_scale
+from uni4d_fg.slam.stages.nonrigid import solve_nonrigid
+from uni4d_fg.slam.stages.observations import Observations, observations_of
+from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise, StaticScene
+from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
+_STOPPED = "stopped; finished stages are kept, --resume continues from them"
 _MAX_DEPARTURE = 0.15
 """A median |log z - log cue| of moving points above this is warned of."""
 
@@ -62,16 +63,8 @@ def camera_init_step(
     if given is not None:
         arrays = {"world_T_cam": given, "intrinsics": sequence.intrinsics}
         return StageRecord(arrays, {"solves": [], "facts": [f"poses taken from the sequence ({config.input.poses})"]})
-    result = initialize_cameras(
-        labelled,
-        sequence.intrinsics,
-        config.camera_init,
-        free_intrinsics=config.input.intrinsics == "free" and config.camera_init.free_intrinsics,
-        unsquared=config.energy == "unsquared",
-        normalization=config.normalization,
-        hooks=hooks,
-        run=run,
-    )
+    solver = StaticSceneSolver(config, run, hooks)
+    result = solver.initialize(labelled, sequence.intrinsics, free_intrinsics=config.input.intrinsics == "free")
     _stop_if_cancelled(result.windows)
     facts = [f"{len(result.windows)} windows, {sum(len(w.iterations) for w in result.windows)} iterations in all"]
     summary: dict[str, Any] = {
@@ -84,7 +77,8 @@ def camera_init_step(
             f"{len(result.bridged_frames)} frame(s) share too few static tracks with those before and start from "
             f"constant velocity: {_listed(result.bridged_frames)}"
         ]
-    return StageRecord({"world_T_cam": result.world_T_cam, "intrinsics": result.intrinsics}, summary)
+    cameras = result.cameras
+    return StageRecord({"world_T_cam": cameras.world_T_cam, "intrinsics": cameras.intrinsics}, summary)
 
 
 def bundle_adjustment_step(
@@ -96,53 +90,50 @@ def bundle_adjustment_step(
     run: StageRunner = run_stage,
 ) -> StageRecord:
     """Stage 2; with fixed poses and no static track the given cameras are kept as they are."""
-    stage = config.bundle_adjustment
-    observations = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
-    if config.energy == "map":
-        observations = weigh_by_drift(observations, labelled.tracks.query_frame, stage.drift_frames)
     fixed = config.input.poses == "fixed"
+    start = Cameras(cameras["world_T_cam"], cameras["intrinsics"], np.zeros(len(cameras["world_T_cam"])))
+    freedom = Freedom(poses=not fixed, intrinsics=config.input.intrinsics == "free")
     try:
-        result = adjust_bundle(
-            observations,
-            cameras["world_T_cam"],
-            cameras["intrinsics"],
-            sequence.intrinsics,
-            stage,
-            Freedom(poses=not fixed, intrinsics=config.input.intrinsics == "free"),
-            unsquared=config.energy == "unsquared",
-            normalization=config.normalization,
-            hooks=hooks,
-            run=run,
-        )
+        scene = StaticSceneSolver(config, run, hooks).adjust(labelled, start, sequence.intrinsics, freedom)
     except DegenerateProblemError as reason:
         if not fixed:
             raise
         return _without_landmarks(cameras, config, str(reason))
-    _stop_if_cancelled(result.solves)
-    return StageRecord(_bundle_arrays(result), _bundle_summary(sequence, result, config))
+    _stop_if_cancelled(scene.solves)
+    return StageRecord(_scene_arrays(scene), _scene_summary(sequence, scene, config))
 
 
-def _bundle_arrays(result: BundleAdjustmentResult) -> dict[str, npt.NDArray[Any]]:
+def _scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
     return {
-        "world_T_cam": result.world_T_cam,
-        "intrinsics": result.intrinsics,
-        "log_scale": result.log_scale,
-        "landmarks": result.landmarks,
-        "landmark_track": result.landmark_track,
-        "landmark_error": result.landmark_error,
-        "pose_covariance": result.pose_covariance,
-        "intrinsics_covariance": result.intrinsics_covariance,
-        "noise": np.array([result.noise.reprojection_sigma_px, result.noise.depth_sigma]),
+        "world_T_cam": scene.cameras.world_T_cam,
+        "intrinsics": scene.cameras.intrinsics,
+        "log_scale": scene.cameras.log_scale,
+        "landmarks": scene.landmarks,
+        "landmark_track": scene.landmark_track,
+        "landmark_error": scene.landmark_error,
+        "pose_covariance": scene.pose_covariance,
+        "intrinsics_covariance": scene.intrinsics_covariance,
+        "noise": np.array([scene.noise.reprojection_sigma_px, scene.noise.depth_sigma]),
     }
 
 
-def _bundle_summary(sequence: Sequence, result: BundleAdjustmentResult, config: Config) -> dict[str, Any]:
-    solves = [solve_dict(s) for s in result.solves]
-    summary = bundle_summary(sequence, _bundle_arrays(result), len(result.observations), result.dropped, solves)
-    summary["exact_energy"] = static_energy(
-        result.world_T_cam, result.intrinsics, result.landmarks, result.observations, config.normalization
-    )
+def _scene_summary(sequence: Sequence, scene: StaticScene, config: Config) -> dict[str, Any]:
+    solves = [solve_dict(s) for s in scene.solves]
+    summary = bundle_summary(sequence, _scene_arrays(scene), len(scene.observations), scene.dropped, solves)
+    summary["exact_energy"] = paper_energy(scene, config.normalization)
     return summary
+
+
+def paper_energy(scene: StaticScene, normalization: Normalization) -> dict[str, float]:
+    """Return the paper's E_BA and E_cam of a static scene, unsmoothed: a yardstick for every solver and energy."""
+    config = BundleAdjustmentConfig(
+        depth_prior=False, camera_motion=CameraMotionConfig(), reprojection_kernel=KernelConfig(kind="norm")
+    )
+    state, held = scene.state(), Freedom(poses=False, intrinsics=False)
+    problem = bundle_adjustment_problem(
+        state, scene.observations, StaticNoise(1.0, 1.0), config, state[INTRINSICS], held, PaperEnergy(normalization)
+    )
+    return problem.energies(state, exact=True)
 
 
 def bundle_summary(
@@ -186,18 +177,24 @@ def _without_landmarks(cameras: Arrays, config: Config, reason: str) -> StageRec
 
 
 def nonrigid_step(
-    labelled: LabelledTracks, scene: Arrays, config: Config, hooks: Hooks, run: StageRunner = run_stage
+    labelled: LabelledTracks,
+    scene: Arrays,
+    config: Config,
+    hooks: Hooks,
+    run: StageRunner = run_stage,
+    timestamps: FloatArray | None = None,
 ) -> StageRecord:
-    """Stage 3; empty without dynamic tracks."""
-    observations, cameras = observations_of(labelled, TrackLabel.DYNAMIC), frozen_cameras(scene)
-    observations, cameras, facts = _correct_cue(observations, labelled, cameras, scene, config)
+    """Stage 3; empty without dynamic tracks. With ``timestamps`` (T,), s, rigid objects too if the config asks."""
+    observations = observations_of(labelled, TrackLabel.DYNAMIC)
+    cameras, noise = frozen_cameras(scene)
+    observations, cameras, noise, facts = _correct_cue(observations, labelled, cameras, noise, scene, config)
     result = solve_nonrigid(
         observations,
         labelled.instance.astype(np.int64),
         cameras,
+        noise,
         config.nonrigid,
-        unsquared=config.energy == "unsquared",
-        normalization=config.normalization,
+        energy_of(config),
         hooks=hooks,
         run=run,
     )
@@ -211,6 +208,14 @@ def nonrigid_step(
     }
     facts.append(f"{len(result.track)} trajectories of {len(np.unique(result.instance))} instances")
     summary: dict[str, Any] = {"solves": [solve_dict(s) for s in solves], "dropped": result.dropped, "facts": facts}
+    if config.rigid_objects.enabled and timestamps is not None:
+        objects, part, found = rigid_objects_part(
+            result, observations, labelled, cameras, noise, timestamps, config, hooks, run
+        )
+        if hooks.should_stop is not None and hooks.should_stop():
+            raise Cancelled(_STOPPED)
+        arrays, summary["rigid_objects"] = {**arrays, **objects}, part
+        facts += found
     departure = _departure_from_cue(result, observations, cameras)
     if departure > _MAX_DEPARTURE:
         summary["warnings"] = [
@@ -220,7 +225,7 @@ def nonrigid_step(
     return StageRecord(arrays, summary)
 
 
-def _departure_from_cue(result: NonRigidResult, observations: Observations, cameras: FrozenCameras) -> float:
+def _departure_from_cue(result: DynamicScene, observations: Observations, cameras: Cameras) -> float:
     """Return the median of |log z - log cue| over the observations of the trajectories; 0 without any."""
     used = observations.select(np.isin(observations.track, result.track) & np.isfinite(observations.depth))
     if len(used) == 0:
@@ -232,34 +237,39 @@ def _departure_from_cue(result: NonRigidResult, observations: Observations, came
 
 
 def _correct_cue(
-    observations: Observations, labelled: LabelledTracks, cameras: FrozenCameras, scene: Arrays, config: Config
-) -> tuple[Observations, FrozenCameras, list[str]]:
+    observations: Observations,
+    labelled: LabelledTracks,
+    cameras: Cameras,
+    noise: StaticNoise,
+    scene: Arrays,
+    config: Config,
+) -> tuple[Observations, Cameras, StaticNoise, list[str]]:
     """Scale the cue at dynamic observations by what the static scene around them says."""
-    if config.energy == "unsquared" or len(observations) == 0 or len(scene["landmarks"]) == 0:
-        return observations, cameras, []
+    if not energy_of(config).is_likelihood or len(observations) == 0 or len(scene["landmarks"]) == 0:
+        return observations, cameras, noise, []
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
     static = static.select(np.isin(static.track, scene["landmark_track"]))
     _, row = static.rows()
     z = world_to_camera(cameras.world_T_cam[static.frame], scene["landmarks"][row])[:, 2]
     measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
-    neighbours = config.nonrigid.local_scale_neighbours
-    local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbours)
+    neighbours, samples = config.nonrigid.local_scale_neighbours, config.nonrigid.local_scale_samples
+    local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbours, samples)
     fact = f"depth cue scaled per {'neighbourhood' if local.is_local else 'frame'}, noise {100 * local.sigma:.1f} %"
     observations = replace(observations, depth=observations.depth * np.exp(local.log_scale))
-    noise = replace(cameras.noise, depth_sigma=max(local.sigma, config.bundle_adjustment.min_depth_sigma))
-    return observations, replace(cameras, log_scale=np.zeros_like(cameras.log_scale), noise=noise), [fact]
+    noise = replace(noise, depth_sigma=max(local.sigma, config.bundle_adjustment.min_depth_sigma))
+    return observations, replace(cameras, log_scale=np.zeros_like(cameras.log_scale)), noise, [fact]
 
 
-def frozen_cameras(scene: Arrays) -> FrozenCameras:
+def frozen_cameras(scene: Arrays) -> tuple[Cameras, StaticNoise]:
     """Return what stage 3 takes from a stage 2 record."""
     pixel, relative = scene["noise"].tolist()
     log_scale: FloatArray = scene["log_scale"]
-    return FrozenCameras(scene["world_T_cam"], scene["intrinsics"], log_scale, StaticNoise(pixel, relative))
+    return Cameras(scene["world_T_cam"], scene["intrinsics"], log_scale), StaticNoise(pixel, relative)
 
 
 def _stop_if_cancelled(solves: list[SolveSummary]) -> None:
     if any(solve.termination is Termination.CANCELLED for solve in solves):
-        raise Cancelled("stopped; finished stages are kept, --resume continues from them")
+        raise Cancelled(_STOPPED)
 
 
 def _listed(frames: tuple[int, ...]) -> str:

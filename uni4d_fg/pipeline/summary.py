@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from uni4d_fg.solve.summary import SolveSummary
+from uni4d_fg.optim.summary import SolveSummary
 
 _MAX_CURVE_POINTS = 200
 

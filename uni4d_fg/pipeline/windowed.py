@@ -13,21 +13,23 @@ import numpy.typing as npt
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.stage import StageRunner
+from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.pipeline.fingerprint import stage_key
+from uni4d_fg.pipeline.rigid import NOT_IN_WINDOWS
 from uni4d_fg.pipeline.steps import Arrays, bundle_summary, given_poses, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.progress import Reporter
-from uni4d_fg.sequence.model import Sequence
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.solve.summary import SolveSummary, Termination
-from uni4d_fg.stages.bundle_adjustment import hold_metric_scale, unknown_covariances
-from uni4d_fg.stages.stage import StageRunner
-from uni4d_fg.tracks.model import LabelledTracks
-from uni4d_fg.windows.join import Cameras, Joined, chain, join
-from uni4d_fg.windows.motion import join_motion
-from uni4d_fg.windows.plan import TrackSpans, Window, blend_weight, tracks_in
-from uni4d_fg.windows.scene import (
+from uni4d_fg.slam.stages.bundle_adjustment import hold_metric_scale
+from uni4d_fg.slam.stages.scene import Cameras, unknown_covariances
+from uni4d_fg.slam.windows.join import Joined, chain, join
+from uni4d_fg.slam.windows.motion import join_motion
+from uni4d_fg.slam.windows.plan import TrackSpans, Window, blend_weight, tracks_in
+from uni4d_fg.slam.windows.scene import (
     WindowLandmarks,
     WindowScene,
     calibrate,
@@ -137,7 +139,10 @@ def motion_step(windowed: WindowedRun, scene: Arrays, key: str, hooks: Hooks) ->
         records.append(windowed.record("motion", window, key, compute))
     weights = [blend_weight(windowed.windows, i) for i in range(len(windowed.windows))]
     arrays = join_motion(windowed.windows, weights, [record.arrays for record in records])
-    return StageRecord(arrays, _joined_summary(arrays, [record.summary for record in records]))
+    summary = _joined_summary(arrays, [record.summary for record in records])
+    if windowed.config.rigid_objects.enabled:
+        summary["facts"].append(NOT_IN_WINDOWS)
+    return StageRecord(arrays, summary)
 
 
 def _calibration(
@@ -160,7 +165,7 @@ def _calibration(
 
 
 def _join(windowed: WindowedRun, scene_of: Callable[[int], WindowScene], intrinsics_covariance: FloatArray) -> Joined:
-    """Join the windows' cameras in rounds; landmarks follow before each linearisation but the first."""
+    """Join the windows' cameras in rounds; landmarks follow before each linearization but the first."""
     config, windows = windowed.config, windowed.windows
     spans = TrackSpans.of(windowed.labelled)
     cameras = chain(windows, [scene_of(i).cameras for i in range(len(windows))])
@@ -174,8 +179,7 @@ def _join(windowed: WindowedRun, scene_of: Callable[[int], WindowScene], intrins
                 scene = place(scene, cameras, config.bundle_adjustment, windowed.run)
             parts.append(information(owned(scene, spans, windows, index), windows, index, config))
         joined = join(parts, cameras, intrinsics_covariance, covariance=number == rounds - 1)
-        poses, scales, _ = hold_metric_scale(joined.cameras.world_T_cam, joined.cameras.log_scale, np.zeros((0, 3)))
-        cameras = Cameras(poses, scales, joined.cameras.intrinsics)
+        cameras = Cameras.of(hold_metric_scale(joined.cameras.state(np.zeros((0, 3)))))
     return replace(joined, cameras=cameras)
 
 

@@ -9,8 +9,8 @@
 #include <cstdint>
 #include <vector>
 
-#include "uni4d_fg/pack.hpp"
 #include "uni4d_fg/robust.hpp"
+#include "uni4d_fg/simd.hpp"
 
 namespace uni4d_fg {
 
@@ -50,8 +50,8 @@ struct RecordGroup {
   int frame;
   int reprojection;  ///< batch whose kernel applies
   int depth;
-  int used;      ///< lanes that hold a record
-  bool first;    ///< these are the first records of their pairs
+  int used;    ///< lanes that hold a record
+  bool first;  ///< these are the first records of their pairs
 };
 
 /// Fields of a group's data, eight lanes each. An absent factor has weight and inverse sigma 0.
@@ -59,12 +59,12 @@ enum Field { kU, kV, kInverseSigmaU, kInverseSigmaV, kWeight, kLogDepth, kInvers
 
 struct LandmarkChunk {
   bool frozen = false;
-  std::vector<int> landmarks;              ///< row of each, at most 64
-  std::vector<int> frames;                 ///< frames that see any of them, ascending
-  std::vector<std::uint64_t> seen;         ///< per frame, bit per landmark
-  std::vector<int> frame_begin;            ///< first pair of each frame, plus the end
-  std::vector<std::uint8_t> pair_landmark; ///< (pairs,) index among `landmarks`
-  std::int64_t first_pair = 0;             ///< of this chunk among all
+  std::vector<int> landmarks;               ///< row of each, at most 64
+  std::vector<int> frames;                  ///< frames that see any of them, ascending
+  std::vector<std::uint64_t> seen;          ///< per frame, bit per landmark
+  std::vector<int> frame_begin;             ///< first pair of each frame, plus the end
+  std::vector<std::uint8_t> pair_landmark;  ///< (pairs,) index among `landmarks`
+  std::int64_t first_pair = 0;              ///< of this chunk among all
   std::vector<RecordGroup> groups;
   AlignedDoubles data;                      ///< (groups, kFields, 8)
   std::vector<std::uint8_t> lane_landmark;  ///< (groups, 8)

@@ -1,4 +1,4 @@
-// The landmark Schur complement of bundle adjustment: linearise, eliminate the landmarks, back-substitute.
+// The landmark Schur complement of bundle adjustment: linearize, eliminate the landmarks, back-substitute.
 //
 //     [ H_cc  E ] [d_c]     [g_c]
 //     [ E^T   V ] [d_l] = - [g_l]        S = H_cc - E V^{-1} E^T,  V block-diagonal with 3x3 blocks
@@ -66,17 +66,33 @@ class LandmarkSystem {
   /// Write the normal equations of the cameras (all of `system` is overwritten); keep those of the landmarks.
   LinearizeResult linearize(const LandmarkState& state, const CameraSystem& system);
 
-  /// Landmark blocks V (N, 3, 3) and gradients (N, 3) of the last linearisation.
+  /// Landmark blocks V (N, 3, 3) and gradients (N, 3) of the last linearization.
   void landmark_blocks(double* blocks, double* gradients) const;
 
-  /// Eliminate the landmarks of the last linearisation.
+  /// Add to the landmark blocks and gradients of the last linearization what factors of other types contribute:
+  /// V_l += blocks (count, 3, 3), of which the symmetric part is taken, and g_l += gradients (count, 3) for
+  /// l = rows (count,), which may repeat and must be free. Returns the largest gradient entry over free landmarks.
+  double add_to_landmarks(std::int64_t count, const std::int64_t* rows, const double* blocks, const double* gradients);
+
+  /// Eliminate the landmarks of the last linearization.
   ///
   /// `hessian` is H_cc with everything that else reads the cameras; `reduced` becomes S with its gradient replaced
   /// by the right-hand side -g_c + E V^{-1} g_l. Returns false if a damped landmark block is not positive definite.
   bool reduce(const DampingBounds& bounds, const CameraSystem& hessian, const CameraSystem& reduced);
 
-  /// Landmark steps (N, 3), 0 for frozen ones, for a camera step (n + 4,), after a successful `reduce`.
-  StepSums back_substitute(const double* camera_step, double* landmark_step) const;
+  /// Whitened coupling (count, 3, n + 5) of free landmarks `rows` after a successful `reduce`: L^{-1} E^T over the core
+  /// columns and the four intrinsics, then L^{-1} g_l, with V + damping D = L L^T.
+  ///
+  /// With it the caller adds a coupling F of its own to E, for which no storage is planned here: the reduced system
+  /// changes by -(E_l V^{-1} F_l^T + F_l V^{-1} E_l^T + F_l V^{-1} F_l^T) and its right-hand side by F_l V^{-1} g_l.
+  void whitened_coupling(std::int64_t count, const std::int64_t* rows, double* out);
+
+  /// L^{-1} (count, 3, 3) of free landmarks `rows` after a successful `reduce`.
+  void inverse_factors(std::int64_t count, const std::int64_t* rows, double* out) const;
+
+  /// Landmark steps (N, 3), 0 for frozen ones, for a camera step d_c (n + 4,), after a successful `reduce`:
+  /// d_l = -V^{-1} (E^T d_c + g_l + extra_l). `extra` (N, 3), or null, is what couplings that are not in E add.
+  StepSums back_substitute(const double* camera_step, const double* extra, double* landmark_step) const;
 
   bool linearized() const { return linearized_; }
   bool reduced() const { return reduced_; }
@@ -89,7 +105,10 @@ class LandmarkSystem {
   double* core_column(const CameraSystem& system, int column) const;
   int workers() const { return static_cast<int>(plan_.worker_begin.size()) - 1; }
 
+  void index_pairs();
+
   LandmarkProblem problem_;
+  int threads_;
   std::vector<Kernel> reprojection_kernels_, depth_kernels_;
   int num_reprojection_ = 0, num_depth_ = 0;
   LandmarkPlan plan_;
@@ -109,6 +128,13 @@ class LandmarkSystem {
   std::vector<AlignedDoubles> tiles_;
   std::vector<AlignedDoubles> scratch_;
   std::vector<std::vector<int>> scratch_place_;
+  /// Pairs of every free landmark, in the order of their frames; made when first asked for.
+  struct LandmarkPair {
+    std::int64_t pair;
+    int frame;
+  };
+  std::vector<std::int64_t> pairs_begin_, pairs_end_;  ///< (N,)
+  std::vector<LandmarkPair> pairs_of_landmark_;
   bool linearized_ = false, reduced_ = false;
 };
 

@@ -20,6 +20,16 @@
 
 namespace uni4d_fg {
 
+// Numbers and SIMD values (simd.hpp) share the names of these operations, so that formulas are written once for both.
+
+/// Larger of a value and a bound; the bound where the value is NaN.
+UNI4D_FG_INLINE double larger(double value, double bound) { return value > bound ? value : bound; }
+/// Smaller of a value and a bound; the value where it is NaN.
+UNI4D_FG_INLINE double at_most(double value, double bound) { return bound < value ? bound : value; }
+UNI4D_FG_INLINE double square_root(double a) { return std::sqrt(a); }
+/// log(1 + a).
+UNI4D_FG_INLINE double log_one_plus(double a) { return std::log1p(a); }
+
 struct Vec3 {
   double x, y, z;
 };
@@ -49,7 +59,9 @@ struct Mat3 {
 };
 
 /// A v.
-UNI4D_FG_INLINE Vec3 operator*(const Mat3& a, const Vec3& v) { return {dot(a.row(0), v), dot(a.row(1), v), dot(a.row(2), v)}; }
+UNI4D_FG_INLINE Vec3 operator*(const Mat3& a, const Vec3& v) {
+  return {dot(a.row(0), v), dot(a.row(1), v), dot(a.row(2), v)};
+}
 
 /// A^T v, which is also (v^T A)^T.
 UNI4D_FG_INLINE Vec3 transposed_times(const Mat3& a, const Vec3& v) {
@@ -75,6 +87,11 @@ UNI4D_FG_INLINE Mat3 transposed(const Mat3& a) {
   return {{a(0, 0), a(1, 0), a(2, 0), a(0, 1), a(1, 1), a(2, 1), a(0, 2), a(1, 2), a(2, 2)}};
 }
 
+/// out = scale * identity (3x3).
+UNI4D_FG_INLINE void store_identity(double scale, double* out) {
+  for (int i = 0; i < 9; ++i) out[i] = i % 4 == 0 ? scale : 0.0;
+}
+
 /// Places of the diagonal in the six values of a symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz.
 constexpr int kDiagonal[3] = {0, 3, 5};
 
@@ -88,7 +105,7 @@ UNI4D_FG_INLINE void add_symmetric_product(const double* s, const double* v, dou
 /// Matrix of the cross product, skew(v) w = v x w.
 UNI4D_FG_INLINE Mat3 skew(const Vec3& v) { return {{0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0}}; }
 
-/// world_T_cam: rotation and camera centre (metres). Tangent: body-frame twist (omega, v), T <- T Exp(omega, v).
+/// world_T_cam: rotation and camera center (metres). Tangent: body-frame twist (omega, v), T <- T Exp(omega, v).
 struct Pose {
   Mat3 rotation;
   Vec3 center;

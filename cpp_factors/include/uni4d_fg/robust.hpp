@@ -1,7 +1,9 @@
-// Robust kernels rho(s) on the whitened residual norm, and the square-root (IRLS) scaling of a linearised factor.
+// Robust kernels rho(s) on the whitened residual norm, and the square-root (IRLS) scaling of a linearized factor.
 #pragma once
 
-#include "uni4d_fg/math.hpp"
+#include <type_traits>
+
+#include "uni4d_fg/simd.hpp"
 
 namespace uni4d_fg {
 
@@ -21,47 +23,78 @@ struct Kernel {
   double threshold = 1.0;
 };
 
+// Each formula is written once, for Real = double and Real = Simd8, without a branch.
+
 /// sqrt(1 + x) - 1 without cancellation.
-UNI4D_FG_INLINE double sqrt1p_minus1(double x) { return x / (std::sqrt(1.0 + x) + 1.0); }
+template <typename Real>
+UNI4D_FG_INLINE Real sqrt1p_minus1(const Real& x) {
+  return x / (square_root(1.0 + x) + 1.0);
+}
 
 /// rho at the squared norm s^2, for a kind known at compile time: use in loops that should become vector code.
-template <KernelKind kind>
-UNI4D_FG_INLINE double kernel_rho(double c, double squared) {
-  if constexpr (kind == KernelKind::quadratic) return 0.5 * squared;
+template <KernelKind kind, typename Real>
+UNI4D_FG_INLINE Real kernel_rho(double c, const Real& squared) {
   if constexpr (kind == KernelKind::huber)
-    return squared <= c * c ? 0.5 * squared : c * std::sqrt(squared) - 0.5 * c * c;
-  if constexpr (kind == KernelKind::pseudo_huber) return c * c * sqrt1p_minus1(squared / (c * c));
-  if constexpr (kind == KernelKind::cauchy) return 0.5 * c * c * std::log1p(squared / (c * c));
-  return c * sqrt1p_minus1(squared / (c * c));
+    return 0.5 * at_most(squared, c * c) + c * (square_root(larger(squared, c * c)) - c);
+  else if constexpr (kind == KernelKind::pseudo_huber)
+    return c * c * sqrt1p_minus1<Real>(squared / (c * c));
+  else if constexpr (kind == KernelKind::cauchy)
+    return 0.5 * c * c * log_one_plus(squared / (c * c));
+  else if constexpr (kind == KernelKind::norm)
+    return c * sqrt1p_minus1<Real>(squared / (c * c));
+  else
+    return 0.5 * squared;
 }
 
 /// w = rho'(s)/s at s^2, for a kind known at compile time.
-template <KernelKind kind>
-UNI4D_FG_INLINE double kernel_weight(double c, double squared) {
-  if constexpr (kind == KernelKind::quadratic) return 1.0;
-  if constexpr (kind == KernelKind::huber) return c / std::sqrt(squared > c * c ? squared : c * c);
-  if constexpr (kind == KernelKind::pseudo_huber) return 1.0 / std::sqrt(1.0 + squared / (c * c));
-  if constexpr (kind == KernelKind::cauchy) return 1.0 / (1.0 + squared / (c * c));
-  return 1.0 / std::sqrt(squared + c * c);
+template <KernelKind kind, typename Real>
+UNI4D_FG_INLINE Real kernel_weight(double c, const Real& squared) {
+  if constexpr (kind == KernelKind::huber)
+    return c / square_root(larger(squared, c * c));
+  else if constexpr (kind == KernelKind::pseudo_huber)
+    return 1.0 / square_root(1.0 + squared / (c * c));
+  else if constexpr (kind == KernelKind::cauchy)
+    return 1.0 / (1.0 + squared / (c * c));
+  else if constexpr (kind == KernelKind::norm)
+    return 1.0 / square_root(squared + c * c);
+  else
+    return Real{} + 1.0;
 }
 
-UNI4D_FG_INLINE double rho(const Kernel& kernel, double squared) {
+template <typename Real>
+UNI4D_FG_INLINE Real rho(const Kernel& kernel, const Real& squared) {
+  const double c = kernel.threshold;
   switch (kernel.kind) {
-    case KernelKind::huber: return kernel_rho<KernelKind::huber>(kernel.threshold, squared);
-    case KernelKind::pseudo_huber: return kernel_rho<KernelKind::pseudo_huber>(kernel.threshold, squared);
-    case KernelKind::cauchy: return kernel_rho<KernelKind::cauchy>(kernel.threshold, squared);
-    case KernelKind::norm: return kernel_rho<KernelKind::norm>(kernel.threshold, squared);
-    default: return 0.5 * squared;
+    case KernelKind::huber:
+      if constexpr (std::is_same_v<Real, double>) {
+        if (!(squared > c * c)) return 0.5 * squared;  // most residuals, which need no root
+      }
+      return kernel_rho<KernelKind::huber>(c, squared);
+    case KernelKind::pseudo_huber:
+      return kernel_rho<KernelKind::pseudo_huber>(c, squared);
+    case KernelKind::cauchy:
+      return kernel_rho<KernelKind::cauchy>(c, squared);
+    case KernelKind::norm:
+      return kernel_rho<KernelKind::norm>(c, squared);
+    default:
+      return kernel_rho<KernelKind::quadratic>(c, squared);
   }
 }
 
-UNI4D_FG_INLINE double weight(const Kernel& kernel, double squared) {
+template <typename Real>
+UNI4D_FG_INLINE Real weight(const Kernel& kernel, const Real& squared) {
+  const double c = kernel.threshold;
   switch (kernel.kind) {
-    case KernelKind::huber: return kernel_weight<KernelKind::huber>(kernel.threshold, squared);
-    case KernelKind::pseudo_huber: return kernel_weight<KernelKind::pseudo_huber>(kernel.threshold, squared);
-    case KernelKind::cauchy: return kernel_weight<KernelKind::cauchy>(kernel.threshold, squared);
-    case KernelKind::norm: return kernel_weight<KernelKind::norm>(kernel.threshold, squared);
-    default: return 1.0;
+    case KernelKind::huber:
+      return kernel_weight<KernelKind::huber>(c, squared);
+    case KernelKind::pseudo_huber:
+      return kernel_weight<KernelKind::pseudo_huber>(c, squared);
+    case KernelKind::cauchy:
+      return kernel_weight<KernelKind::cauchy>(c, squared);
+    case KernelKind::norm:
+      return kernel_weight<KernelKind::norm>(c, squared);
+    default:
+      return kernel_weight<KernelKind::quadratic>(c, squared);
   }
 }
 
@@ -70,11 +103,15 @@ UNI4D_FG_INLINE double weight(const Kernel& kernel, double squared) {
 UNI4D_FG_INLINE double falloff(const Kernel& kernel, double squared) {
   const double ratio = squared / (kernel.threshold * kernel.threshold);
   switch (kernel.kind) {
-    case KernelKind::huber: return ratio > 1.0 ? 1.0 : 0.0;
-    case KernelKind::cauchy: return ratio < 1.0 ? 2.0 * ratio / (1.0 + ratio) : 1.0;
+    case KernelKind::huber:
+      return ratio > 1.0 ? 1.0 : 0.0;
+    case KernelKind::cauchy:
+      return ratio < 1.0 ? 2.0 * ratio / (1.0 + ratio) : 1.0;
     case KernelKind::pseudo_huber:
-    case KernelKind::norm: return 1.0 - 1.0 / (1.0 + ratio);
-    default: return 0.0;
+    case KernelKind::norm:
+      return 1.0 - 1.0 / (1.0 + ratio);
+    default:
+      return 0.0;
   }
 }
 

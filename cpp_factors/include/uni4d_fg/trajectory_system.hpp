@@ -1,7 +1,8 @@
 /// The normal equations of many moving points, and their inexact solution by conjugate gradients.
 ///
 /// Unknowns are P points (3 each), rows ordered by track and frame, all free. Factors read one point (reprojection,
-/// depth prior), two or three (temporal smoothness) or four (as-rigid-as-possible). The damped normal equations
+/// depth prior), two or three (temporal smoothness) or four (as-rigid-as-possible); factors of any other type come
+/// linearized. The damped normal equations
 /// (J^T J + damping D) d = -J^T r are solved by preconditioned conjugate gradients; the preconditioner is the exact
 /// block of every track on its own, block pentadiagonal with 3x3 blocks, factored by Cholesky track by track.
 ///
@@ -67,6 +68,9 @@ class TrajectorySystem {
   /// r = d(p0, p1) - d(p2, p3), d the distance smoothed at zero.
   void add_arap(const TrajectoryRows& rows);
 
+  /// Factors of any other type, known by their linearization alone: `slots` points and `dim` residuals each.
+  void add_linearized(const std::int64_t* rows, std::int64_t count, int slots, int dim);
+
   /// Order the factors and plan all sums; call once after the last batch.
   void plan();
 
@@ -80,7 +84,16 @@ class TrajectorySystem {
   bool planned() const { return planned_; }
   bool linearized() const { return linearized_; }
 
-  /// Energy of every batch, sum of weight rho(|r / sigma|), at points (P, 3).
+  bool is_linearized(int batch) const { return batches_[static_cast<std::size_t>(batch)].kind == Kind::kLinearized; }
+  int num_slots(int batch) const { return batches_[static_cast<std::size_t>(batch)].slots; }
+  int dim(int batch) const { return batches_[static_cast<std::size_t>(batch)].dim; }
+  /// Give the next `linearize` the residuals (N, dim) and Jacobians (N, dim, slots, 3) of a batch of add_linearized,
+  /// whitened and scaled by the roots of weight and kernel.
+  void set_linearized(int batch, const double* residual, const double* jacobians);
+  /// The first batch of add_linearized whose values the last `linearize` used up; -1 if there is none.
+  int missing_linearization() const;
+
+  /// Energy of every batch, sum of weight rho(|r / sigma|), at points (P, 3); 0 for those of add_linearized.
   std::vector<double> energies(const double* points) const;
   /// Form the gradient J^T r and all blocks at points (P, 3). Returns the first factor that is not finite, if any.
   /// @param kernel_curvature  Part of the kernels' falloff that the blocks account for, in [0, 1); 0 reweights only.
@@ -95,7 +108,7 @@ class TrajectorySystem {
                                       int cg_max_iterations);
 
  private:
-  enum class Kind { kReprojection, kDepth, kSmoothness, kArap };
+  enum class Kind { kReprojection, kDepth, kSmoothness, kArap, kLinearized };
 
   /// Camera frozen in the data of a factor; few distinct ones serve many factors.
   struct FrozenCamera {
@@ -119,6 +132,14 @@ class TrajectorySystem {
     std::int32_t first_loose = 0;           ///< Smoothness factors from here on couple beyond the bands.
     std::int32_t first_factor = 0;          ///< ARAP: position in the list of all ARAP factors.
     std::int32_t size() const { return static_cast<std::int32_t>(weight.size()); }
+
+    // Batches of add_linearized.
+    std::vector<double> residual;              ///< (N, dim)
+    std::vector<double> jacobians;             ///< (N, dim, slots, 3)
+    std::vector<std::uint8_t> inside_bands;    ///< (N) whether all products within a track are within the bands.
+    std::vector<std::int32_t> use_start, use;  ///< (P + 1) and (N slots): factor * slots + slot, point by point.
+    std::size_t first_change = 0;              ///< Where the changes (N, dim) of a product stand among all.
+    bool set = false;                          ///< Since the last linearization.
   };
 
   struct Entry {
@@ -137,6 +158,7 @@ class TrajectorySystem {
   void plan_inside(Batch& batch);
   void plan_edges();
   void plan_arap_blocks();
+  void plan_uses();
   bool complete(const std::int32_t* rows, int slots) const;
   bool regular(std::int32_t factor) const;
 
@@ -154,6 +176,10 @@ class TrajectorySystem {
   void linearize_loose(const Batch& batch, int batch_index, const double* points, double kernel_curvature,
                        NonFinite& bad);
   void multiply_loose(const double* vector, double* result) const;
+
+  void gather_linearized(int chunk);
+  void linearized_changes(const double* vector, int worker, int workers, double* changes) const;
+  void add_linearized_products(std::size_t point, const double* changes, double* out) const;
 
   class ConjugateGradients;
   bool factorize_chunk(int chunk, double damping, double min_diagonal, double max_diagonal);
@@ -185,18 +211,20 @@ class TrajectorySystem {
   std::vector<LagEntry> lag_entries_;
   std::vector<std::int32_t> irregular_;
   std::vector<std::uint8_t> factor_regular_;
-  mutable std::vector<double> distance_;                ///< (E)
-  std::vector<double> direction_;                       ///< (E, 3)
-  std::vector<double> factor_weight_, factor_force_;    ///< (F) stiffness, and pull on the first of its edges.
-  std::vector<double> edge_stiffness_, edge_force_;     ///< (E) sums over factors.
-  std::vector<double> edge_diagonal_;                   ///< (E) as edge_stiffness_, regular factors only.
+  mutable std::vector<double> distance_;              ///< (E)
+  std::vector<double> direction_;                     ///< (E, 3)
+  std::vector<double> factor_weight_, factor_force_;  ///< (F) stiffness, and pull on the first of its edges.
+  std::vector<double> edge_stiffness_, edge_force_;   ///< (E) sums over factors.
+  std::vector<double> edge_diagonal_;                 ///< (E) as edge_stiffness_, regular factors only.
 
-  std::vector<double> gradient_;      ///< (3 P)
-  std::vector<double> inside_;        ///< (P, 18) J^T J of factors within a track: block, lag 1, lag 2, all symmetric.
-  std::vector<double> blocks_;        ///< (P, 24) all of J^T J within a track: block, lag 1, lag 2.
+  std::size_t linearized_rows_ = 0;  ///< Residuals of all batches of add_linearized.
+
+  std::vector<double> gradient_;  ///< (3 P)
+  std::vector<double> inside_;    ///< (P, 18) J^T J of factors within a track: block, lag 1, lag 2, all symmetric.
+  std::vector<double> blocks_;    ///< (P, 24) all of J^T J within a track: block, lag 1, lag 2.
   std::vector<double> loose_stiffness_;  ///< Smoothness beyond the bands: symmetric stiffness (factors, 6).
-  std::vector<double> added_;         ///< (3 P) damping.
-  std::vector<float> factor_;         ///< (P, 24) Cholesky: inverse of the diagonal block, lags 1 and 2.
+  std::vector<double> added_;            ///< (3 P) damping.
+  std::vector<float> factor_;            ///< (P, 24) Cholesky: inverse of the diagonal block, lags 1 and 2.
 };
 
 }  // namespace uni4d_fg

@@ -1,5 +1,6 @@
 // The landmark system on exact observations: Gauss-Newton steps must reach the truth, in every storage and for every
 // number of threads, without touching memory that is not theirs.
+#include <algorithm>
 #include <cstdio>
 #include <random>
 #include <stdexcept>
@@ -166,10 +167,10 @@ double solve_from_disturbed(Scene scene, bool depth, bool banded, int length, in
     system.energies(state, energies.data());
     energy = 0.0;
     for (const double part : energies) energy += part;
-    check(system.linearize(state, hessian.view()).finite, "the linearisation is finite");
+    check(system.linearize(state, hessian.view()).finite, "the linearization is finite");
     check(system.reduce({1e-9, 1e-9, 1e32}, hessian.view(), reduced.view()), "landmarks are determined");
     const std::vector<double> camera = camera_step(problem, reduced);
-    const StepSums sums = system.back_substitute(camera.data(), step.data());
+    const StepSums sums = system.back_substitute(camera.data(), nullptr, step.data());
     check(sums.squared >= 0.0, "the sums are finite");
     for (std::size_t t = 0; t < static_cast<std::size_t>(scene.num_frames); ++t) {
       double xi[kFrameColumns] = {};
@@ -187,6 +188,84 @@ double solve_from_disturbed(Scene scene, bool depth, bool banded, int length, in
   std::printf("depth %d banded %d threads %d kernel %d: %zu observations, energy %.3g\n", depth, banded, threads,
               static_cast<int>(kernel.kind), scene.pose.size(), energy);
   return energy;
+}
+
+/// What other factors are told of the elimination must be what it did: S = H + damping - W^T W over all landmarks.
+void test_foreign_factors(const Scene& scene, bool banded, int length, int threads) {
+  const LandmarkProblem problem = make_problem(scene, true, banded, length, {KernelKind::huber, 1.0});
+  LandmarkSystem system(problem, threads);
+  System normal(problem), reduced(problem);
+  system.linearize({scene.poses.data(), scene.intrinsics.data(), scene.log_scale.data(), scene.landmarks.data()},
+                   normal.view());
+  std::vector<std::int64_t> rows;
+  for (std::int64_t i = 0; i < scene.num_landmarks; ++i)
+    if (problem.landmark_free[static_cast<std::size_t>(i)] != 0) rows.push_back(i);
+  // Each twice, so that blocks add up.
+  std::vector<std::int64_t> twice = rows;
+  twice.insert(twice.end(), rows.begin(), rows.end());
+  const auto all = static_cast<std::size_t>(scene.num_landmarks), count = rows.size();
+  const auto landmarks = static_cast<std::int64_t>(count);
+  std::vector<double> blocks, gradients, before(9 * all), before_gradient(3 * all), after(9 * all), gradient(3 * all);
+  for (std::size_t i = 0; i < twice.size(); ++i) {
+    for (std::size_t k = 0; k < 9; ++k) blocks.push_back(k % 4 == 0 ? 3.0 : 0.5);
+    for (std::size_t k = 0; k < 3; ++k) gradients.push_back(static_cast<double>(i % 5) - 1.0);
+  }
+  system.landmark_blocks(before.data(), before_gradient.data());
+  const double largest = system.add_to_landmarks(2 * landmarks, twice.data(), blocks.data(), gradients.data());
+  system.landmark_blocks(after.data(), gradient.data());
+  double expected_largest = 0.0;
+  for (const std::int64_t row : rows)
+    for (std::size_t k = 0; k < 9; ++k) {
+      const std::size_t at = 9 * static_cast<std::size_t>(row) + k;
+      check_close(after[at] - before[at], k % 4 == 0 ? 6.0 : 1.0, 1e-8, "blocks add up");
+      if (k < 3)
+        expected_largest = std::max(expected_largest, std::abs(gradient[3 * static_cast<std::size_t>(row) + k]));
+    }
+  check_close(largest, expected_largest, 1e-12, "largest gradient");
+  const DampingBounds bounds{0.3, 1e-6, 1e32};
+  check(system.reduce(bounds, normal.view(), reduced.view()), "the landmarks are determined");
+
+  const auto n = static_cast<std::size_t>(problem.num_columns), width = n + kBorder + 1;
+  const auto stored = static_cast<std::size_t>(problem.stored_rows);
+  std::vector<double> whitened(count * 3 * width), inverse(9 * count);
+  system.whitened_coupling(landmarks, rows.data(), whitened.data());
+  system.inverse_factors(landmarks, rows.data(), inverse.data());
+  const auto product = [&](std::size_t i, std::size_t j) {
+    double sum = 0.0;
+    for (std::size_t k = 0; k < 3 * count; ++k) sum += whitened[k * width + i] * whitened[k * width + j];
+    return sum;
+  };
+  for (std::size_t j = 0; j < n; ++j) {
+    for (std::size_t i = j; i < std::min(n, banded ? j + stored : n); ++i) {
+      const std::size_t at = j * stored + (banded ? i - j : i);
+      const double damping = i == j ? bounds.damping * normal.core[at] : 0.0;
+      check_close(reduced.core[at], normal.core[at] + damping - product(i, j), 1e-8, "reduced core");
+    }
+    for (std::size_t k = 0; k < kBorder; ++k)
+      check_close(reduced.border[j * kBorder + k], normal.border[j * kBorder + k] - product(j, n + k), 1e-8, "border");
+    check_close(reduced.gradient[j], product(j, n + kBorder) - normal.gradient[j], 1e-8, "right-hand side");
+  }
+
+  std::vector<double> step(3 * all), extra(3 * all, 0.7);
+  const std::vector<double> nothing(n + kBorder, 0.0);
+  const StepSums sums = system.back_substitute(nothing.data(), extra.data(), step.data());
+  double squared = 0.0, slope = 0.0;
+  for (std::size_t i = 0; i < count; ++i) {
+    const double* l = inverse.data() + 9 * i;  // L^{-1}, row-major
+    const auto row = static_cast<std::size_t>(rows[i]);
+    double x[3] = {};
+    for (std::size_t k = 0; k < 3; ++k)
+      for (std::size_t m = 0; m < 3; ++m) x[k] += l[3 * k + m] * (gradient[3 * row + m] + extra[3 * row + m]);
+    for (std::size_t k = 0; k < 3; ++k) {
+      const double expected = -(l[k] * x[0] + l[3 + k] * x[1] + l[6 + k] * x[2]);
+      check_close(step[3 * row + k], expected, 1e-10, "step of a landmark");
+      squared += expected * expected;
+      slope += gradient[3 * row + k] * expected;
+    }
+  }
+  check_close(sums.squared, squared, 1e-9, "squared step");
+  check_close(sums.slope, slope, 1e-9, "slope");
+  check(step[0] == 0.0, "a frozen landmark stays");
 }
 
 void test_degenerate_problems() {
@@ -237,5 +316,7 @@ int main() {
     for (const bool banded : {false, true})
       for (const int threads : {1, 3})
         check(solve_from_disturbed(many, depth, banded, 8, threads, kernels[1]) < 1e-10, "steps reach the truth");
+  for (const bool banded : {false, true}) test_foreign_factors(few, banded, 6, 1);
+  test_foreign_factors(make_scene(12, 400, 5, random), true, 5, 3);
   return 0;
 }

@@ -1,9 +1,9 @@
-// PairSystem: gradient against central differences of the energy, partly frozen entries, tiles of every length, threads.
-#include "pair_system.hpp"
-
+// PairSystem: gradient against central differences of the energy, partly frozen entries, tiles of every length,
+// threads.
 #include <random>
 
 #include "check.hpp"
+#include "pair_system.hpp"
 #include "uni4d_fg/parallel.hpp"
 
 using namespace uni4d_fg;
@@ -69,12 +69,12 @@ void check_gradient(int count, bool sorted, KernelKind kind, int threads, std::m
     entry = before;
     return (up - down) / (2.0 * step);
   };
-  // All rotations are the identity, so that a body-frame translation is one of the centre.
+  // All rotations are the identity, so that a body-frame translation is one of the center.
   for (int i = 1; i < kPoses; ++i)
     for (int d = 0; d < 3; ++d) {
       const auto column = static_cast<std::size_t>(pose_columns[static_cast<std::size_t>(6 * i + 3 + d)]);
       check_close(gradient[column], slope(scene.poses[static_cast<std::size_t>(16 * i + 4 * d + 3)], 1e-6), 1e-4,
-                  "gradient of a centre");
+                  "gradient of a center");
     }
   for (std::size_t i = 0; i < 2; ++i)
     check_close(gradient[i], slope(scene.intrinsics[i], 1e-4), 1e-4, "gradient of a focal length");

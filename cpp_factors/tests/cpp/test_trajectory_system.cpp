@@ -1,25 +1,19 @@
 // TrajectorySystem without Python: consistency of energy, gradient, product and step; degenerate shapes; threads.
 // Meant to run under AddressSanitizer and UndefinedBehaviorSanitizer.
-#include "uni4d_fg/trajectory_system.hpp"
-
 #include <cmath>
 #include <cstdio>
-#include <cstdlib>
 #include <limits>
 #include <random>
 #include <vector>
+
+#include "check.hpp"
+#include "uni4d_fg/trajectory_system.hpp"
 
 using uni4d_fg::Kernel;
 using uni4d_fg::KernelKind;
 using uni4d_fg::TrajectorySystem;
 
 namespace {
-
-void check(bool condition, const char* what) {
-  if (condition) return;
-  std::fprintf(stderr, "FAILED: %s\n", what);
-  std::exit(1);
-}
 
 struct Scene {
   int tracks, frames;
@@ -50,7 +44,8 @@ TrajectorySystem make_system(const Scene& scene, Kernel kernel, bool scrambled, 
       for (auto& row : rows) row = any(random);
     }
     const std::vector<double> sigma(n * static_cast<std::size_t>(dim), 0.7), weight(n, 1.3);
-    call(uni4d_fg::TrajectoryRows{rows.data(), static_cast<std::int64_t>(n), sigma.data(), true, weight.data(), kernel});
+    call(
+        uni4d_fg::TrajectoryRows{rows.data(), static_cast<std::int64_t>(n), sigma.data(), true, weight.data(), kernel});
   };
   std::vector<std::int64_t> own, velocity, acceleration, arap;
   for (int k = 0; k < scene.tracks; ++k) {
@@ -73,8 +68,10 @@ TrajectorySystem make_system(const Scene& scene, Kernel kernel, bool scrambled, 
     depth.push_back(2.0 + 0.1 * (i % 3));
     log_scale.push_back(0.01);
   }
-  add(1, 2, own, [&](const auto& rows) { system.add_dynamic_reprojection(rows, uv.data(), poses.data(), intrinsics.data()); });
-  add(1, 1, own, [&](const auto& rows) { system.add_dynamic_depth_prior(rows, depth.data(), poses.data(), log_scale.data()); });
+  add(1, 2, own,
+      [&](const auto& rows) { system.add_dynamic_reprojection(rows, uv.data(), poses.data(), intrinsics.data()); });
+  add(1, 1, own,
+      [&](const auto& rows) { system.add_dynamic_depth_prior(rows, depth.data(), poses.data(), log_scale.data()); });
   add(2, 3, velocity, [&](const auto& rows) { system.add_smoothness(rows, 2); });
   add(3, 3, acceleration, [&](const auto& rows) { system.add_smoothness(rows, 3); });
   add(4, 1, arap, [&](const auto& rows) { system.add_arap(rows); });
@@ -127,6 +124,67 @@ void test_consistency(int tracks, int frames, KernelKind kind, bool scrambled) {
   check(repeated.has_value() && repeated->delta == result->delta, "threads change no bit");
 }
 
+/// Factors of 1 to 8 slots on any points, some twice in a factor, against J v and J^T w computed one by one.
+void test_linearized(int tracks, int frames) {
+  std::mt19937 random(5);
+  const Scene scene = make_scene(tracks, frames, random);
+  const auto points = static_cast<std::int64_t>(scene.track.size());
+  std::normal_distribution<double> normal;
+  std::uniform_int_distribution<std::int64_t> any(0, points - 1);
+  struct Factors {
+    std::size_t count, slots, dim;
+    std::vector<std::int64_t> rows;
+    std::vector<double> residual, jacobians;
+  };
+  std::vector<Factors> batches;
+  for (const std::size_t slots : {std::size_t{1}, std::size_t{3}, std::size_t{8}}) {
+    Factors batch{slots == 3 ? std::size_t{200} : std::size_t{5}, slots, 2 * slots, {}, {}, {}};
+    for (std::size_t i = 0; i < batch.count * slots; ++i) batch.rows.push_back(any(random));
+    for (std::size_t i = 0; i < batch.count * batch.dim; ++i) batch.residual.push_back(normal(random));
+    for (std::size_t i = 0; i < batch.count * batch.dim * slots * 3; ++i) batch.jacobians.push_back(normal(random));
+    batches.push_back(batch);
+  }
+  batches.push_back({0, 2, 1, {}, {}, {}});
+  std::vector<double> direction(3 * static_cast<std::size_t>(points)), first_step;
+  for (double& value : direction) value = normal(random);
+  for (const int threads : {1, 3}) {
+    TrajectorySystem system(scene.track.data(), points, threads);
+    for (const Factors& batch : batches)
+      system.add_linearized(batch.rows.data(), static_cast<std::int64_t>(batch.count), static_cast<int>(batch.slots),
+                            static_cast<int>(batch.dim));
+    system.plan();
+    check(system.missing_linearization() == 0, "values are missing");
+    for (std::size_t b = 0; b < batches.size(); ++b)
+      system.set_linearized(static_cast<int>(b), batches[b].residual.data(), batches[b].jacobians.data());
+    check(!system.linearize(scene.points.data()).any(), "every factor is finite");
+    check(total(system, scene.points) == 0.0, "energies are the caller's");
+    std::vector<double> gradient(direction.size()), product(direction.size()), actual(direction.size());
+    for (const Factors& batch : batches)
+      for (std::size_t n = 0; n < batch.count; ++n)
+        for (std::size_t i = 0; i < batch.dim; ++i) {
+          const double* jacobian = &batch.jacobians[3 * batch.slots * (n * batch.dim + i)];
+          double change = 0.0;
+          for (std::size_t k = 0; k < 3 * batch.slots; ++k)
+            change +=
+                jacobian[k] * direction[3 * static_cast<std::size_t>(batch.rows[n * batch.slots + k / 3]) + k % 3];
+          for (std::size_t k = 0; k < 3 * batch.slots; ++k) {
+            const std::size_t at = 3 * static_cast<std::size_t>(batch.rows[n * batch.slots + k / 3]) + k % 3;
+            gradient[at] += jacobian[k] * batch.residual[n * batch.dim + i];
+            product[at] += jacobian[k] * change;
+          }
+        }
+    system.multiply(direction.data(), actual.data());
+    for (std::size_t i = 0; i < direction.size(); ++i) {
+      check_close(system.gradient()[i], gradient[i], 1e-11, "gradient of linearized factors");
+      check_close(actual[i], product[i], 1e-11, "product of linearized factors");
+    }
+    const auto step = system.solve(1e-2, 1e-6, 1e32, 1e-8, 3000);
+    check(step.has_value(), "the preconditioner is positive definite");
+    if (first_step.empty()) first_step = step->delta;
+    check(step->delta == first_step, "threads change no bit");
+  }
+}
+
 void test_not_finite() {
   std::mt19937 random(3);
   Scene scene = make_scene(3, 4, random);
@@ -140,8 +198,8 @@ void test_not_finite() {
 }  // namespace
 
 int main() {
-  for (const KernelKind kind : {KernelKind::quadratic, KernelKind::huber, KernelKind::pseudo_huber, KernelKind::cauchy,
-                                KernelKind::norm}) {
+  for (const KernelKind kind :
+       {KernelKind::quadratic, KernelKind::huber, KernelKind::pseudo_huber, KernelKind::cauchy, KernelKind::norm}) {
     for (const bool scrambled : {false, true}) {
       test_consistency(1, 1, kind, scrambled);
       test_consistency(1, 9, kind, scrambled);
@@ -150,6 +208,9 @@ int main() {
     }
   }
   test_consistency(80, 30, KernelKind::huber, false);
+  test_linearized(1, 1);
+  test_linearized(4, 3);
+  test_linearized(60, 30);
   test_not_finite();
   std::puts("trajectory system: passed");
   return 0;

@@ -9,11 +9,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.structure.two_view import parallax
-from uni4d_fg.stages.observations import Observations
-
-_SAMPLED_FRAMES = 20
-_ENOUGH_TRACKS = 300
-_FITTED_TRACKS = 250
+from uni4d_fg.slam.stages.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ def rank_pairs(
     *,
     known_focal: bool,
 ) -> list[FramePair]:
-    """Rank pairs of (at most 20, evenly spaced) frames, best first.
+    """Rank pairs of ``sampled_frames`` evenly spaced frames, best first.
 
     A pair is worth its parallax up to ``start_parallax_px``, times the root of its common tracks: with that
     many, more tracks say more than a longer baseline.
@@ -61,7 +57,7 @@ def rank_pairs(
         config: Thresholds.
         known_focal: Whether the focal lengths are exact.
     """
-    sampled = evenly_spread(num_frames, _SAMPLED_FRAMES).tolist()
+    sampled = evenly_spread(num_frames, config.sampled_frames).tolist()
     common_tracks = CommonTracks(observations, num_frames)
     pairs = []
     for position, first in enumerate(sampled):
@@ -69,11 +65,11 @@ def rank_pairs(
             a, b = common_tracks.between(first, second)
             if len(a) < config.min_common_tracks:
                 break  # tracks only get fewer
-            used = evenly_spread(len(a), _FITTED_TRACKS)
+            used = evenly_spread(len(a), config.fitted_tracks)
             moved = parallax(observations.uv[a[used]], observations.uv[b[used]], intrinsics, known_focal=known_focal)
             pairs.append(FramePair(first, second, moved, len(a)))
     return sorted(pairs, key=lambda pair: -_worth(pair, config))
 
 
 def _worth(pair: FramePair, config: GeometricDepthConfig) -> float:
-    return min(pair.parallax_px, config.start_parallax_px) * float(np.sqrt(min(pair.common, _ENOUGH_TRACKS)))
+    return min(pair.parallax_px, config.start_parallax_px) * float(np.sqrt(min(pair.common, config.enough_tracks)))

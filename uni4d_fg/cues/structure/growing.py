@@ -9,26 +9,25 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
 from uni4d_fg.cues.structure.triangulation import RayBundle, ray_angles, sound, triangulate
 from uni4d_fg.cues.structure.two_view import relative_pose
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
+from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
-from uni4d_fg.graph.state import State, VariableNames
-from uni4d_fg.sequence.calibration import intrinsics_matrix
-from uni4d_fg.solve.levenberg_marquardt import Hooks
-from uni4d_fg.solve.marginals import camera_marginals
-from uni4d_fg.solve.summary import Termination
-from uni4d_fg.stages.bundle_adjustment import Freedom, StaticNoise, bundle_adjustment_stage, without_camera_motion
-from uni4d_fg.stages.observations import Observations
-from uni4d_fg.stages.stage import Stage, run_stage
-
-_RESECTION_TRIALS = 500
-_FOCAL_NEEDS_FRAMES = 3
-"""Two views alone do not determine a focal length robustly."""
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.marginals import camera_marginals
+from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.summary import Termination
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, without_camera_motion
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.scene import StaticNoise
 
 
 @dataclass
@@ -78,7 +77,9 @@ class GrowingScene:
         settings = self.config.geometric_depth
         a, b = CommonTracks(self.observations, len(self.world_T_cam)).between(pair.first, pair.second)
         uv = self.observations.uv
-        found = relative_pose(uv[a], uv[b], self.intrinsics, 0.5 * settings.max_reprojection_px)
+        found = relative_pose(
+            uv[a], uv[b], self.intrinsics, 0.5 * settings.max_reprojection_px, settings.two_view_trials
+        )
         if found is None:
             return 0
         self.world_T_cam[pair.second] = found.first_T_second
@@ -106,7 +107,7 @@ class GrowingScene:
         nearest = int(known[np.argmin(np.abs(known - frame))])
         pose = _resect(
             self.position[self.row[mine]], self.observations.uv[mine], self.intrinsics,
-            self.world_T_cam[nearest], settings.max_reprojection_px, settings.min_pose_points,
+            self.world_T_cam[nearest], settings,
         )  # fmt: skip
         if pose is None:
             return False
@@ -122,7 +123,7 @@ class GrowingScene:
         settings = self.config.geometric_depth
         used = np.flatnonzero(which[self.row] & self.registered[self.observations.frame])
         rows, local = np.unique(self.row[used], return_inverse=True)
-        points = triangulate(self._rays(used, local, len(rows)))
+        points = triangulate(self._rays(used, local, len(rows)), settings.triangulation_huber_px)
         fits = sound(points, settings.max_reprojection_px, settings.min_angle_deg)
         self.position[rows] = np.where(fits[:, None], points.position, np.nan)
         self._judge()
@@ -138,21 +139,21 @@ class GrowingScene:
         state, summary = run_stage(stage, state, Hooks(should_stop=self.should_stop))
         if summary.termination is Termination.CANCELLED:
             raise Cancelled("structure from motion stopped")
-        self.world_T_cam[frames] = se3.orthonormalize(state["pose"])
-        self.intrinsics = state["intrinsics"][0].copy()
-        self.position[rows] = state["landmark"]
+        self.world_T_cam[frames] = se3.orthonormalize(state[POSE])
+        self.intrinsics = state[INTRINSICS][0].copy()
+        self.position[rows] = state[LANDMARK]
         self._forget_flat()
         self._judge()
 
     def focal_deviation(self) -> float:
         """Return the marginal standard deviation of the focal lengths, as a part of their value; 0 if held."""
         stage, state, _, _ = self._bundle()
-        if "intrinsics" not in stage.free:
+        if not stage.problem.is_free(INTRINSICS):
             return 0.0
-        marginals = camera_marginals(stage.problem, state, stage.solver, stage.eliminate)
+        marginals = camera_marginals(stage.problem, state, stage.solver, stage.problem.eliminated)
         if marginals is None:
             return float("nan")
-        variance = np.diag(marginals.blocks("intrinsics", 1)[0])[:2]
+        variance = np.diag(marginals.blocks(INTRINSICS, 1)[0])[:2]
         return float(np.sqrt(np.max(variance / self.intrinsics[:2] ** 2)))
 
     def _bundle(self) -> tuple[Stage, State, IntArray, IntArray]:
@@ -167,23 +168,23 @@ class GrowingScene:
         used = replace(used, frame=position_of[used.frame])
         rows = np.unique(self.row[keep])
         groups = {
-            "pose": self.world_T_cam[frames],
-            "intrinsics": self.intrinsics[None],
-            "landmark": self.position[rows],
+            POSE: self.world_T_cam[frames],
+            INTRINSICS: self.intrinsics[None],
+            LANDMARK: self.position[rows],
         }
-        state = State(groups, VariableNames(landmark_track=used.rows()[0]))
+        state = State(groups, {LANDMARK: used.rows()[0]})
         settings = geometric_bundle_adjustment(self.config.bundle_adjustment)
-        stage = bundle_adjustment_stage(
+        problem = bundle_adjustment_problem(
             state,
             used,
             StaticNoise(settings.reprojection_sigma_px, settings.depth_sigma),
             settings,
             self.prior_intrinsics[None],
-            Freedom(poses=True, intrinsics=self.free_focal and len(frames) >= _FOCAL_NEEDS_FRAMES),
-            unsquared=False,
-            normalization="mean",
+            Freedom(
+                poses=True, intrinsics=self.free_focal and len(frames) >= self.config.geometric_depth.focal_min_frames
+            ),
         )
-        return stage, state, frames, rows
+        return Stage("bundle_adjustment", problem, settings.solver), state, frames, rows
 
     def cost(self, frames: BoolArray) -> float:
         """Return the mean truncated squared error, in [0, 1], over all observations in the given frames (T,).
@@ -247,19 +248,20 @@ def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustm
 
 
 def _resect(
-    points: FloatArray, uv: FloatArray, intrinsics: FloatArray, guess: FloatArray, threshold_px: float, min_points: int
+    points: FloatArray, uv: FloatArray, intrinsics: FloatArray, guess: FloatArray, config: GeometricDepthConfig
 ) -> FloatArray | None:
     """Return the pose (4, 4) of a camera that sees N world points (N, 3) at uv (N, 2), or None."""
-    if len(points) < min_points:
+    if len(points) < config.min_pose_points:
         return None
     matrix = intrinsics_matrix(intrinsics)
     start = se3.inverse(guess)
     rotation, translation = cv2.Rodrigues(start[:3, :3])[0], start[:3, 3:].copy()
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points, uv, matrix, None, rvec=rotation, tvec=translation, useExtrinsicGuess=False,
-        iterationsCount=_RESECTION_TRIALS, reprojectionError=threshold_px, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+        iterationsCount=config.resection_trials, reprojectionError=config.max_reprojection_px, confidence=0.9999,
+        flags=cv2.SOLVEPNP_SQPNP,
     )  # fmt: skip
-    if not found or inliers is None or len(inliers) < min_points:
+    if not found or inliers is None or len(inliers) < config.min_pose_points:
         return None
     index = inliers[:, 0]
     rotation, translation = cv2.solvePnPRefineLM(points[index], uv[index], matrix, None, rotation, translation)

@@ -17,11 +17,8 @@ from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.progress import Reporter
-from uni4d_fg.stages.noise import robust_sigma
-from uni4d_fg.stages.observations import Observations
-
-_TRIED_PAIRS = 4
-_FRAMES_OF_A_TRIAL = 8
+from uni4d_fg.slam.stages.noise import robust_sigma
+from uni4d_fg.slam.stages.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -117,7 +114,7 @@ def _best_start(
 ) -> tuple[GrowingScene | None, FramePair | None]:
     """Try pairs and focal lengths on a few frames; return the scene that explains the tracks best."""
     best: tuple[float, GrowingScene, FramePair] | None = None
-    tried = [(pair, 1.0) for pair in pairs[:_TRIED_PAIRS]]
+    tried = [(pair, 1.0) for pair in pairs[: config.geometric_depth.tried_pairs]]
     while tried:
         pair, factor = tried.pop(0)
         scene = GrowingScene.empty(
@@ -146,7 +143,9 @@ def _trial(scene: GrowingScene, pair: FramePair) -> float | None:
         raise Cancelled("structure from motion stopped")
     if scene.start(pair) < scene.config.geometric_depth.min_pose_points:
         return None
-    between = np.unique(np.linspace(pair.first, pair.second, _FRAMES_OF_A_TRIAL).astype(np.int64))
+    between = np.unique(
+        np.linspace(pair.first, pair.second, scene.config.geometric_depth.trial_frames).astype(np.int64)
+    )
     for frame in between.tolist():
         if not scene.registered[frame]:
             scene.register(frame)
@@ -200,9 +199,10 @@ def _triangulate_all(observations: Observations, poses: FloatArray, scene: Growi
     """Triangulate every track from the frames with a pose, twice: the second time without what did not fit."""
     observations = observations.select(scene.registered[observations.frame])
     tracks, row = observations.rows()
-    limit = scene.config.geometric_depth.max_reprojection_px
+    settings = scene.config.geometric_depth
+    limit, huber_px = settings.max_reprojection_px, settings.triangulation_huber_px
     rays = RayBundle(row, poses[observations.frame], observations.uv, scene.intrinsics, len(tracks))
-    points = triangulate(rays.select(triangulate(rays).errors_of(rays) <= limit))
+    points = triangulate(rays.select(triangulate(rays, huber_px).errors_of(rays) <= limit), huber_px)
     with np.errstate(invalid="ignore"):
         wrong = ~(points.error_px <= limit)
     points.position[wrong] = np.nan

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray
-from uni4d_fg.stages.observations import Observations
+from uni4d_fg.slam.stages.observations import Observations
 
 _COLUMNS, _ROWS = 12, 9
+"""Parts of a frame, each of which is to be seen."""
 _MIN_OBSERVATIONS = 3
+"""Shorter tracks are taken only where there are no longer ones."""
 
 
 def spread_tracks(observations: Observations, image_size: tuple[int, int], count: int) -> BoolArray:

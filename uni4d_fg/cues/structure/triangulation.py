@@ -20,9 +20,10 @@ from uni4d_fg.factors.projection import chain_to_world_point, projection_derivat
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, unproject, world_to_camera
 
 _STEPS = 8
-_HUBER_PX = 1.0
 _RIDGE = 1e-9
+"""Part of the trace that makes a matrix safe to invert; rays with a smaller eigenvalue are parallel."""
 _CONVERGED = 1e-5
+"""A step below this part of the distance ends the refinement of a point."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,13 @@ class Points:
         return error
 
 
-def triangulate(rays: RayBundle) -> Points:
-    """Triangulate M tracks; one with fewer than two rays, or with parallel ones, is NaN."""
+def triangulate(rays: RayBundle, huber_px: float) -> Points:
+    """Triangulate M tracks; one with fewer than two rays, or with parallel ones, is NaN.
+
+    Args:
+        rays: What the frames see.
+        huber_px: Reprojection errors above this count less, px.
+    """
     centre = rays.world_T_cam[:, :3, 3]
     in_camera: FloatArray = unproject(rays.intrinsics, rays.uv, np.ones(len(rays.uv)))
     direction = np.einsum("nij,nj->ni", rays.world_T_cam[:, :3, :3], in_camera)
@@ -77,7 +83,7 @@ def triangulate(rays: RayBundle) -> Points:
     solvable = np.linalg.eigvalsh(matrix)[:, 0] > _RIDGE
     position = np.full((rays.count, 3), np.nan)
     position[solvable] = np.linalg.solve(matrix[solvable], right[solvable][..., None])[..., 0]
-    position, information = _refine(rays, position)
+    position, information = _refine(rays, position, huber_px)
     z = world_to_camera(rays.world_T_cam, position[rays.row])[:, 2]
     with np.errstate(invalid="ignore"):
         behind = np.bincount(rays.row, ~(z > NEAR_PLANE), rays.count) > 0
@@ -142,7 +148,7 @@ def median_per_row(values: FloatArray, row: IntArray, count: int) -> FloatArray:
     return result
 
 
-def _refine(rays: RayBundle, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _refine(rays: RayBundle, position: FloatArray, huber_px: float) -> tuple[FloatArray, FloatArray]:
     """Lower the robust reprojection error of every point; return positions and information (M, 3, 3)."""
     position = position.copy()
     information = np.zeros((rays.count, 3, 3))
@@ -158,7 +164,7 @@ def _refine(rays: RayBundle, position: FloatArray) -> tuple[FloatArray, FloatArr
         by_x, _ = projection_derivatives(np.broadcast_to(rays.intrinsics, (len(x), 4)), x)
         jacobian = chain_to_world_point(by_x, poses)
         residual = rays.uv[used] - project(rays.intrinsics, x)
-        weight = 1.0 / np.maximum(np.linalg.norm(residual, axis=1) / _HUBER_PX, 1.0)
+        weight = 1.0 / np.maximum(np.linalg.norm(residual, axis=1) / huber_px, 1.0)
         weighted = jacobian * weight[:, None, None]
         hessian = _sum_rows(np.swapaxes(weighted, 1, 2) @ jacobian, row, len(tracks))
         gradient = _sum_rows((residual[:, None] @ weighted)[:, 0], row, len(tracks))

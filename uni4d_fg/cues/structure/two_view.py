@@ -23,8 +23,9 @@ from uni4d_fg.geometry.camera import project, unproject
 
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 7)
 _REWEIGHTINGS = 4
+"""Reweighted solves of the rotation fit."""
 _CONFIDENCE = 0.9999
-_MAX_TRIALS = 5000
+"""Probability of a sample without outliers at which trials end early."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray
 
 
 def relative_pose(
-    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, threshold_px: float
+    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, threshold_px: float, max_trials: int
 ) -> RelativePose | None:
     """Find the pose between two views by a robust essential matrix; None if there is none.
 
@@ -93,6 +94,7 @@ def relative_pose(
         uv_second: (N, 2) px.
         intrinsics: (4,) px.
         threshold_px: Distance to the epipolar line up to which a pair agrees.
+        max_trials: Trials at most.
 
     Returns:
         The pose; the same input gives the same result (OpenCV's MAGSAC draws from a fixed seed).
@@ -107,7 +109,7 @@ def relative_pose(
         method=cv2.USAC_MAGSAC,
         prob=_CONFIDENCE,
         threshold=threshold_px / float(np.mean(intrinsics[:2])),
-        maxIters=_MAX_TRIALS,
+        maxIters=max_trials,
     )
     if essential is None or essential.shape != (3, 3):
         return None

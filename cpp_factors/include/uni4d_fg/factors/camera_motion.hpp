@@ -5,11 +5,9 @@
 //     translation   a = c_now - c_before,        b = c_after - c_now          m, world axes
 #pragma once
 
-#include "uni4d_fg/math.hpp"
+#include "uni4d_fg/factor_type.hpp"
 
 namespace uni4d_fg::camera_motion {
-
-constexpr int kDim = 3;
 
 /// Rotation vector (rad) of a rotation matrix; singular for a half turn.
 UNI4D_FG_INLINE Vec3 rotation_log(const Mat3& r) {
@@ -24,8 +22,8 @@ UNI4D_FG_INLINE Vec3 rotation_log(const Mat3& r) {
 /// Jr^{-1} with Log(Exp(omega) Exp(d)) = omega + Jr^{-1} d; the left Jacobian's inverse is its transpose.
 UNI4D_FG_INLINE Mat3 inverse_right_jacobian(const Vec3& omega) {
   const double angle = std::sqrt(dot(omega, omega));
-  const double coefficient = angle < 1e-4 ? 1.0 / 12.0 + angle * angle / 720.0
-                                          : (1.0 - 0.5 * angle / std::tan(0.5 * angle)) / (angle * angle);
+  const double coefficient =
+      angle < 1e-4 ? 1.0 / 12.0 + angle * angle / 720.0 : (1.0 - 0.5 * angle / std::tan(0.5 * angle)) / (angle * angle);
   const Mat3 w = skew(omega), squared = w * w;
   Mat3 out;
   for (int i = 0; i < 9; ++i) out.m[i] = (i % 4 == 0 ? 1.0 : 0.0) + 0.5 * w.m[i] + coefficient * squared.m[i];
@@ -62,49 +60,72 @@ UNI4D_FG_INLINE void store_half(const Mat3& block, int first, double* out) {
     for (int j = 0; j < 3; ++j) out[6 * i + first + j] = block(i, j);
 }
 
-UNI4D_FG_INLINE void rotation_residual(const Pose& before, const Pose& now, const Pose& after, double floor, double* r) {
-  const Vec3 a = rotation_log(transposed_times(before.rotation, now.rotation));
-  const Vec3 b = rotation_log(transposed_times(now.rotation, after.rotation));
-  store(relative_change(a, b, floor), r);
-}
-
-/// r (3) and d r / d each pose (3x6), row-major.
-UNI4D_FG_INLINE void rotation_linearize(const Pose& before, const Pose& now, const Pose& after, double floor, double* r,
-                                        double* by_before, double* by_now, double* by_after) {
-  const Vec3 a = rotation_log(transposed_times(before.rotation, now.rotation));
-  const Vec3 b = rotation_log(transposed_times(now.rotation, after.rotation));
-  Mat3 by_a, by_b;
-  store(relative_change(a, b, floor, by_a, by_b), r);
-  const Mat3 right_a = inverse_right_jacobian(a), right_b = inverse_right_jacobian(b);
-  Mat3 first = by_a * transposed(right_a), middle = by_a * right_a;
-  const Mat3 middle_b = by_b * transposed(right_b);
-  for (int i = 0; i < 9; ++i) {
-    first.m[i] = -first.m[i];
-    middle.m[i] -= middle_b.m[i];
-  }
-  store_half(first, 0, by_before);
-  store_half(middle, 0, by_now);
-  store_half(by_b * right_b, 0, by_after);
-}
-
-UNI4D_FG_INLINE void translation_residual(const Pose& before, const Pose& now, const Pose& after, double floor,
-                                          double* r) {
-  store(relative_change(now.center - before.center, after.center - now.center, floor), r);
-}
-
-/// r (3) and d r / d each pose (3x6), row-major.
-UNI4D_FG_INLINE void translation_linearize(const Pose& before, const Pose& now, const Pose& after, double floor,
-                                           double* r, double* by_before, double* by_now, double* by_after) {
-  Mat3 by_a, by_b;
-  store(relative_change(now.center - before.center, after.center - now.center, floor, by_a, by_b), r);
-  Mat3 first = by_a * before.rotation, difference;
-  for (int i = 0; i < 9; ++i) {
-    first.m[i] = -first.m[i];
-    difference.m[i] = by_a.m[i] - by_b.m[i];
-  }
-  store_half(first, 3, by_before);
-  store_half(difference * now.rotation, 3, by_now);
-  store_half(by_b * after.rotation, 3, by_after);
-}
-
 }  // namespace uni4d_fg::camera_motion
+
+namespace uni4d_fg {
+
+struct CameraRotation {
+  static constexpr const char* kName = "camera_rotation";
+  static constexpr int kDim = 3;
+  static constexpr auto kVariables =
+      arguments(argument<Pose>("before"), argument<Pose>("now"), argument<Pose>("after"));
+  static constexpr auto kData = arguments(positive_argument<double>("floor"));
+
+  UNI4D_FG_INLINE static void residual(const Pose& before, const Pose& now, const Pose& after, double floor,
+                                       double* r) {
+    using namespace camera_motion;
+    const Vec3 a = rotation_log(transposed_times(before.rotation, now.rotation));
+    const Vec3 b = rotation_log(transposed_times(now.rotation, after.rotation));
+    store(relative_change(a, b, floor), r);
+  }
+
+  UNI4D_FG_INLINE static void linearize(const Pose& before, const Pose& now, const Pose& after, double floor, double* r,
+                                        double* by_before, double* by_now, double* by_after) {
+    using namespace camera_motion;
+    const Vec3 a = rotation_log(transposed_times(before.rotation, now.rotation));
+    const Vec3 b = rotation_log(transposed_times(now.rotation, after.rotation));
+    Mat3 by_a, by_b;
+    store(relative_change(a, b, floor, by_a, by_b), r);
+    const Mat3 right_a = inverse_right_jacobian(a), right_b = inverse_right_jacobian(b);
+    Mat3 first = by_a * transposed(right_a), middle = by_a * right_a;
+    const Mat3 middle_b = by_b * transposed(right_b);
+    for (int i = 0; i < 9; ++i) {
+      first.m[i] = -first.m[i];
+      middle.m[i] -= middle_b.m[i];
+    }
+    store_half(first, 0, by_before);
+    store_half(middle, 0, by_now);
+    store_half(by_b * right_b, 0, by_after);
+  }
+};
+UNI4D_FG_FACTOR_TYPE(CameraRotation)
+
+struct CameraTranslation {
+  static constexpr const char* kName = "camera_translation";
+  static constexpr int kDim = 3;
+  static constexpr auto kVariables = CameraRotation::kVariables;
+  static constexpr auto kData = CameraRotation::kData;
+
+  UNI4D_FG_INLINE static void residual(const Pose& before, const Pose& now, const Pose& after, double floor,
+                                       double* r) {
+    store(camera_motion::relative_change(now.center - before.center, after.center - now.center, floor), r);
+  }
+
+  UNI4D_FG_INLINE static void linearize(const Pose& before, const Pose& now, const Pose& after, double floor, double* r,
+                                        double* by_before, double* by_now, double* by_after) {
+    using namespace camera_motion;
+    Mat3 by_a, by_b;
+    store(relative_change(now.center - before.center, after.center - now.center, floor, by_a, by_b), r);
+    Mat3 first = by_a * before.rotation, difference;
+    for (int i = 0; i < 9; ++i) {
+      first.m[i] = -first.m[i];
+      difference.m[i] = by_a.m[i] - by_b.m[i];
+    }
+    store_half(first, 3, by_before);
+    store_half(difference * now.rotation, 3, by_now);
+    store_half(by_b * after.rotation, 3, by_after);
+  }
+};
+UNI4D_FG_FACTOR_TYPE(CameraTranslation)
+
+}  // namespace uni4d_fg

@@ -1,11 +1,9 @@
 // Depth prior: r = log z - log depth - log_scale, log continued by its tangent below the near plane; dimensionless.
 #pragma once
 
-#include "uni4d_fg/camera.hpp"
+#include "uni4d_fg/factor_type.hpp"
 
 namespace uni4d_fg::depth_prior {
-
-constexpr int kDim = 1;
 
 /// r (1) of a point (world, m), the logarithm of the depth cue and the frame's log-scale.
 UNI4D_FG_INLINE void residual(const Pose& pose, const Vec3& point, double log_scale, double log_cue, double* r) {
@@ -36,3 +34,45 @@ UNI4D_FG_INLINE void linearize_point(const Pose& pose, const Vec3& point, double
 }
 
 }  // namespace uni4d_fg::depth_prior
+
+namespace uni4d_fg {
+
+struct StaticDepthPrior {
+  static constexpr const char* kName = "static_depth_prior";
+  static constexpr int kDim = 1;
+  static constexpr auto kVariables =
+      arguments(argument<Pose>("world_T_cam"), argument<Vec3>("landmark"), argument<double>("log_scale"));
+  static constexpr auto kData = arguments(positive_argument<double>("depth"));
+
+  UNI4D_FG_INLINE static void residual(const Pose& pose, const Vec3& landmark, double log_scale, double depth,
+                                       double* r) {
+    depth_prior::residual(pose, landmark, log_scale, std::log(depth), r);
+  }
+
+  UNI4D_FG_INLINE static void linearize(const Pose& pose, const Vec3& landmark, double log_scale, double depth,
+                                        double* r, double* by_pose, double* by_landmark, double* by_log_scale) {
+    depth_prior::linearize(pose, landmark, log_scale, std::log(depth), r, by_pose, by_landmark, by_log_scale);
+  }
+};
+UNI4D_FG_FACTOR_TYPE(StaticDepthPrior)
+
+/// The same on a point of one frame, with its camera and log-scale frozen.
+struct DynamicDepthPrior {
+  static constexpr const char* kName = "dynamic_depth_prior";
+  static constexpr int kDim = 1;
+  static constexpr auto kVariables = arguments(argument<Vec3>("dynamic_point"));
+  static constexpr auto kData =
+      arguments(positive_argument<double>("depth"), argument<Pose>("world_T_cam"), argument<double>("log_scale"));
+
+  UNI4D_FG_INLINE static void residual(const Vec3& point, double depth, const Pose& pose, double log_scale, double* r) {
+    depth_prior::residual(pose, point, log_scale, std::log(depth), r);
+  }
+
+  UNI4D_FG_INLINE static void linearize(const Vec3& point, double depth, const Pose& pose, double log_scale, double* r,
+                                        double* by_point) {
+    depth_prior::linearize_point(pose, point, log_scale, std::log(depth), r, by_point);
+  }
+};
+UNI4D_FG_FACTOR_TYPE(DynamicDepthPrior)
+
+}  // namespace uni4d_fg

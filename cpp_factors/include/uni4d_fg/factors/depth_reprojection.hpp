@@ -1,11 +1,9 @@
-// Depth reprojection of a frame pair: r = uv_target - project(K, T_target^{-1} T_source unproject(K, uv_source, depth)).
+// Depth reprojection of a frame pair: r = uv_target - project(K, T_target^{-1} T_source unproject(K, uv_source, d)).
 #pragma once
 
-#include "uni4d_fg/camera.hpp"
+#include "uni4d_fg/factor_type.hpp"
 
 namespace uni4d_fg::depth_reprojection {
-
-constexpr int kDim = 2;
 
 /// r (2) px; `target_T_source` is relative_pose(target, source).
 UNI4D_FG_INLINE void residual(const Pose& target_T_source, const Intrinsics& k, const double* uv_source, double depth,
@@ -30,8 +28,10 @@ UNI4D_FG_INLINE void linearize_target(const Pose& target_T_source, const Intrins
   for (int i = 0; i < 12; ++i) by_target[i] = -by_target[i];
   // Derivative by x_source, columns 0 and 1: the lifted ray moves with the intrinsics.
   const Mat3& rotation = target_T_source.rotation;
-  const double u_0 = p.u_x * rotation(0, 0) + p.u_z * rotation(2, 0), u_1 = p.u_x * rotation(0, 1) + p.u_z * rotation(2, 1);
-  const double v_0 = p.v_y * rotation(1, 0) + p.v_z * rotation(2, 0), v_1 = p.v_y * rotation(1, 1) + p.v_z * rotation(2, 1);
+  const double u_0 = p.u_x * rotation(0, 0) + p.u_z * rotation(2, 0),
+               u_1 = p.u_x * rotation(0, 1) + p.u_z * rotation(2, 1);
+  const double v_0 = p.v_y * rotation(1, 0) + p.v_z * rotation(2, 0),
+               v_1 = p.v_y * rotation(1, 1) + p.v_z * rotation(2, 1);
   const double x_fx = x_source.x / k.fx, y_fy = x_source.y / k.fy, d_fx = depth / k.fx, d_fy = depth / k.fy;
   by_intrinsics[0] = u_0 * x_fx - p.u_fx;
   by_intrinsics[1] = u_1 * y_fy;
@@ -48,9 +48,37 @@ UNI4D_FG_INLINE void source_from_target(const Pose& target_T_source, const doubl
   for (int row = 0; row < 2; ++row) {
     const Vec3 by_omega = load_vec3(by_target + 6 * row), by_v = load_vec3(by_target + 6 * row + 3);
     // Ad = [R 0; skew(c) R  R] in the order (omega, v), so (a, b) Ad = ((a + b x c) R, b R).
-    store(-transposed_times(target_T_source.rotation, by_omega + cross(by_v, target_T_source.center)), by_source + 6 * row);
+    store(-transposed_times(target_T_source.rotation, by_omega + cross(by_v, target_T_source.center)),
+          by_source + 6 * row);
     store(-transposed_times(target_T_source.rotation, by_v), by_source + 6 * row + 3);
   }
 }
 
 }  // namespace uni4d_fg::depth_reprojection
+
+namespace uni4d_fg {
+
+struct DepthReprojection {
+  static constexpr const char* kName = "depth_reprojection";
+  static constexpr int kDim = 2;
+  static constexpr auto kVariables =
+      arguments(argument<Pose>("source_pose"), argument<Pose>("target_pose"), argument<Intrinsics>("intrinsics"));
+  static constexpr auto kData =
+      arguments(argument<Vector<2>>("uv_source"), positive_argument<double>("depth"), argument<Vector<2>>("uv_target"));
+
+  UNI4D_FG_INLINE static void residual(const Pose& source, const Pose& target, const Intrinsics& k, Vector<2> uv_source,
+                                       double depth, Vector<2> uv_target, double* r) {
+    depth_reprojection::residual(relative_pose(target, source), k, uv_source, depth, uv_target, r);
+  }
+
+  UNI4D_FG_INLINE static void linearize(const Pose& source, const Pose& target, const Intrinsics& k,
+                                        Vector<2> uv_source, double depth, Vector<2> uv_target, double* r,
+                                        double* by_source, double* by_target, double* by_intrinsics) {
+    const Pose relative = relative_pose(target, source);
+    depth_reprojection::linearize_target(relative, k, uv_source, depth, uv_target, r, by_target, by_intrinsics);
+    depth_reprojection::source_from_target(relative, by_target, by_source);
+  }
+};
+UNI4D_FG_FACTOR_TYPE(DepthReprojection)
+
+}  // namespace uni4d_fg

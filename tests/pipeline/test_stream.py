@@ -1,0 +1,170 @@
+"""Streams into a folder: interrupted, killed and resumed they end as if nothing had happened."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from stream_samples import feed, stream_config
+from stream_samples import stream as stream_of
+from typer.testing import CliRunner
+
+from uni4d_fg.cli.main import app
+from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.write import write_native
+from uni4d_fg.pipeline.stream import stream_sequence
+from uni4d_fg.pipeline.stream_checkpoint import restore, state_arrays
+from uni4d_fg.results.evaluate.tum import read_tum
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.slam.incremental import IncrementalReconstructor
+
+FRAMES = 30
+CONFIG = stream_config(
+    "incremental.window=6", "incremental.nonrigid_lag=4", "incremental.nonrigid_window=7",
+    "incremental.keyframe_parallax=0.006", "incremental.checkpoint_interval=7",
+)  # fmt: skip
+FEW = {"grid_columns": 14, "grid_rows": 10}
+"""Tracks enough for a stream that is compared with itself."""
+KILLED = Path(__file__).with_name("stream_killed.py")
+
+
+def stream(num_frames: int, **changes: Any) -> Sequence:
+    return stream_of(num_frames, **(FEW | changes))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    summary = stream_sequence(stream(FRAMES), folder, CONFIG)
+    assert summary.num_frames == FRAMES
+    assert sum(summary.counts.values()) == FRAMES
+    return folder
+
+
+def assert_same(folder: Path, expected: Path) -> None:
+    """Assert that two streams hold the same reconstruction, number by number."""
+    found, wanted = (load_reconstruction(f / "reconstruction.npz") for f in (folder, expected))
+    for name in found.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
+    np.testing.assert_array_equal(
+        read_tum(folder / "trajectory.tum").world_T_cam, read_tum(expected / "trajectory.tum").world_T_cam
+    )
+    assert not list(folder.rglob(".tmp-*"))
+
+
+def assert_in_order(trajectory: Path) -> None:
+    """Assert that a trajectory that is still being written has every frame once."""
+    lines = trajectory.read_text().splitlines() if trajectory.exists() else []
+    timestamps = [float(line.split()[0]) for line in lines]
+    assert timestamps == sorted(set(timestamps))
+
+
+@pytest.mark.parametrize("stop_before", [0, 3, 16, 29])
+def test_an_interrupted_stream_goes_on_where_it_was(tmp_path: Path, undisturbed: Path, stop_before: int) -> None:
+    polls = iter(range(FRAMES + 1))
+    with pytest.raises(Cancelled, match=f"before frame {stop_before}"):
+        stream_sequence(stream(FRAMES), tmp_path, CONFIG, should_stop=lambda: next(polls) == stop_before)
+    summary = stream_sequence(stream(FRAMES), tmp_path, CONFIG, resume=True)
+    assert summary.resumed_from == stop_before
+    assert_same(tmp_path, undisturbed)
+
+
+def test_a_killed_stream_goes_on_from_its_last_checkpoint(
+    tmp_path: Path, undisturbed: Path, rng: np.random.Generator
+) -> None:
+    work = tmp_path / "work.pickle"
+    work.write_bytes(pickle.dumps((stream(FRAMES), CONFIG)))
+    moments = [f"frame:{rng.integers(1, 8)}", f"frame:{rng.integers(8, 15)}", "write:2", f"write:{rng.integers(3, 7)}"]
+    folder = tmp_path / "run"
+    program = [sys.executable, str(KILLED), str(work), str(folder), *moments]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        for moment in moments:
+            process.stdin.write("go\n")
+            process.stdin.flush()
+            assert process.stdout.readline() == f"{signal.SIGKILL.value}\n", f"not killed at {moment}"
+            assert_in_order(folder / "trajectory.tum")
+    assert process.returncode == 0
+    stream_sequence(stream(FRAMES), folder, CONFIG, resume=True)
+    assert_same(folder, undisturbed)
+
+
+def test_poses_are_on_disk_as_frames_leave_the_window(tmp_path: Path) -> None:
+    lines: list[int] = []
+
+    def count(_: object) -> None:
+        path = tmp_path / "trajectory.tum"
+        lines.append(len(path.read_text().splitlines()) if path.exists() else 0)
+
+    stream_sequence(stream(FRAMES), tmp_path, CONFIG, on_frame=count)
+    assert lines[0] == 0
+    assert lines[-1] > 5
+    assert (np.diff(lines) >= 0).all()
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(tmp_path: Path) -> None:
+    polls = iter(range(FRAMES))
+    with pytest.raises(Cancelled):
+        stream_sequence(stream(FRAMES), tmp_path, CONFIG, should_stop=lambda: next(polls) == 5)
+    with pytest.raises(InputError, match="another configuration"):
+        stream_sequence(stream(FRAMES), tmp_path, stream_config(), resume=True)
+    (tmp_path / "stages" / "stream.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"stream\.npz"):
+        stream_sequence(stream(FRAMES), tmp_path, CONFIG, resume=True)
+
+
+def test_the_verb(tmp_path: Path) -> None:
+    write_native(stream(10, objects="none"), tmp_path / "seq")
+    run = tmp_path / "run"
+    words = ["stream", str(tmp_path / "seq"), "--out", str(run), "--quiet"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert "10 frames" in result.output
+    assert "frames a second" in result.output
+    assert load_reconstruction(run / "reconstruction.npz").num_frames == 10
+    assert CliRunner().invoke(app, words).exit_code != 0
+    again = CliRunner().invoke(app, [*words, "--overwrite"])
+    assert again.exit_code == 0, again.output
+
+
+def test_the_verb_on_a_bare_video(tmp_path: Path) -> None:
+    sequence, video = stream(8, objects="none", render_images=True), tmp_path / "alone.mp4"
+    write_native(sequence, tmp_path / "seq")
+    height, width = sequence.image_size
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (width, height))
+    for image in sequence.images:
+        writer.write(image[:, :, ::-1])
+    writer.release()
+    words = ["stream", str(video), "--quiet", "--out", str(tmp_path / "run")]
+    refused = CliRunner().invoke(app, words)
+    assert refused.exit_code != 0
+    assert "has no depth" in str(refused.exception or refused.output)
+    assert not (tmp_path / "run").exists()
+    depth = next(path for path in (tmp_path / "seq").iterdir() if path.name.startswith("depth_cue"))
+    result = CliRunner().invoke(app, [*words, "--depth", str(depth)])
+    assert result.exit_code == 0, result.output
+    assert load_reconstruction(tmp_path / "run" / "reconstruction.npz").num_frames == 8
+
+
+def test_a_restored_state_is_the_stored_one_in_every_array() -> None:
+    solver, _ = feed(stream(FRAMES), CONFIG, frames=list(range(12)))
+    stored = state_arrays(solver)
+    sequence = stream(FRAMES)
+    again = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, CONFIG)
+    restore(again, stored)
+    found = state_arrays(again)
+    assert found.keys() == stored.keys()
+    for name, array in stored.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    del stored["window_noise"]
+    with pytest.raises(InputError, match="damaged"):
+        restore(again, stored)

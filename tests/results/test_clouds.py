@@ -1,0 +1,65 @@
+"""PLY files: round trip, empty clouds, refusal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uni4d_fg.errors import InputError, MissingDependencyError, OutputError
+from uni4d_fg.optional import import_open3d
+from uni4d_fg.results.clouds import read_ply, write_clouds, write_ply
+from uni4d_fg.results.run_folder import RunFolder
+
+
+@pytest.fixture(autouse=True)
+def _open3d_present() -> None:
+    try:
+        import_open3d()
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
+
+
+def random_cloud(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, 3)), rng.integers(0, 256, (count, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_round_trip(tmp_path: Path, count: int) -> None:
+    points, colors = random_cloud(0, count)
+    path = tmp_path / "clouds" / "static.ply"
+    write_ply(path, points, colors)
+    assert [p.name for p in path.parent.iterdir()] == ["static.ply"]
+    again_points, again_colors = read_ply(path)
+    np.testing.assert_allclose(again_points, points, atol=1e-6)
+    np.testing.assert_array_equal(again_colors, colors)
+    assert path.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0")
+
+
+def test_every_frame_gets_a_file(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    count = write_clouds(folder, random_cloud(1, 10), (random_cloud(i, 3 * i) for i in range(4)))
+    assert count == 4
+    names = sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*.ply"))
+    assert names == [*(f"clouds/dynamic/{i:05d}.ply" for i in range(4)), "clouds/static.ply"]
+    assert len(read_ply(folder.dynamic_cloud(3))[0]) == 9
+
+
+def test_what_is_no_cloud_is_refused(tmp_path: Path) -> None:
+    points, colors = random_cloud(2, 4)
+    with pytest.raises(OutputError, match="must both be"):
+        write_ply(tmp_path / "a.ply", points, colors[:3])
+    points[0, 0] = np.nan
+    with pytest.raises(OutputError, match="NaN"):
+        write_ply(tmp_path / "a.ply", points, colors)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="no such file"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_a_folder_in_the_way_is_an_output_error(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").mkdir()
+    with pytest.raises(OutputError, match="cannot write"):
+        write_ply(tmp_path / "a.ply", *random_cloud(3, 4))

@@ -1,0 +1,192 @@
+"""The viewer's server, with and without a browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewing_samples import browser_page, copied, free_port, opened
+
+from uni4d_fg import optional
+from uni4d_fg.cli import main
+from uni4d_fg.errors import ConfigError, MissingDependencyError
+from uni4d_fg.results.view.server import check_address, viewer_server
+from uni4d_fg.results.view.viewer import Viewer
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'uni4d-fg[view]'")
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+def test_a_port_in_use_is_one_clear_error(finished_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match="--port"):
+            check_address("127.0.0.1", port)
+        assert main.run(["view", str(finished_run), "--port", str(port)]) == ConfigError.exit_code
+        error = capsys.readouterr().err
+        assert error.startswith(f"error: cannot serve at 127.0.0.1:{port}: Address already in use")
+        assert error.count("\n") == 1
+    with pytest.raises(ConfigError, match="no-such-host"):
+        check_address("no-such-host.invalid", free_port())
+
+
+def test_a_missing_extra_is_one_clear_sentence(finished_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> object:
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    monkeypatch.setattr(optional.importlib, "import_module", missing)
+    with (
+        pytest.raises(MissingDependencyError, match=r"pip install 'uni4d-fg\[view\]'"),
+        viewer_server("127.0.0.1", free_port(), "x"),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("verb", ["view", "report"])
+def test_what_is_no_run_is_refused_before_anything_is_started(
+    verb: str, finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = copied(finished_run, tmp_path)
+    (copy / "summary.json").unlink()
+    for folder, text in ((tmp_path / "nosuch", "no such folder"), (tmp_path, "holds no run"), (copy, "--resume")):
+        assert main.run([verb, str(folder)]) == 3
+        out, error = capsys.readouterr()
+        assert out == ""
+        assert text in error
+        assert error.count("\n") == 1
+
+
+def drawn(server: object, name: str) -> int:
+    """Number of points of a node of the scene."""
+    return len(server.scene._handle_from_node_name[name].points)  # type: ignore[attr-defined]
+
+
+def test_the_panel_drives_the_scene(finished_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = free_port()
+    run = opened(finished_run)
+    with viewer_server("127.0.0.1", port, "a run") as server:
+        viewer = Viewer(server, run)
+        panel = viewer.panel
+        assert b"<html" in urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).read()[:2000]
+        panel.frame.value = 5
+        viewer.refresh()
+        assert "frame 5" in panel.facts.content
+        heads = run.reconstruction.dynamic_points[:, 5]
+        assert drawn(server, "/moving/points") == np.isfinite(heads).all(axis=1).sum()
+        assert drawn(server, "/static/landmarks") == len(run.reconstruction.landmarks)
+        panel.color.value = "residual"
+        viewer.refresh()
+        assert "reprojection error" in panel.legend.content
+        ticks = iter(range(10))
+        panel.play.value = True
+        panel.frames_per_second.value = 60
+        viewer.run_until(lambda: next(ticks) == 9)
+        assert panel.frame.value == (5 + 9) % run.num_frames
+    assert capsys.readouterr().out == ""
+
+
+def test_axes_of_rigid_objects_follow_the_frame(finished_run: Path) -> None:
+    run = opened(finished_run)
+    frames = run.num_frames
+    poses = np.tile(np.eye(4), (1, frames, 1, 1))
+    poses[0, :, 0, 3] = np.arange(frames)
+    poses[0, 0] = np.nan
+    changed = dataclasses.replace(
+        run.reconstruction, object_instance=np.array([3], np.int32), object_world_T_object=poses
+    )
+    with viewer_server("127.0.0.1", free_port(), "a run") as server:
+        assert not Viewer(server, run).panel.objects.visible
+    with viewer_server("127.0.0.1", free_port(), "a run") as server:
+        viewer = Viewer(server, run.with_parts(reconstruction=changed))
+        node = server.scene._handle_from_node_name["/moving/object_3"]
+        assert viewer.panel.objects.visible
+        assert not node.visible
+        viewer.panel.frame.value = 5
+        viewer.refresh()
+        node = server.scene._handle_from_node_name["/moving/object_3"]
+        assert node.visible
+        np.testing.assert_allclose(node.position, [5.0, 0.0, 0.0])
+        viewer.panel.objects.value = False
+        viewer.refresh()
+        assert not server.scene._handle_from_node_name["/moving/object_3"].visible
+
+
+def test_it_serves_this_machine_only_and_ctrl_c_ends_it_with_0(finished_run: Path) -> None:
+    port = free_port()
+    command = [sys.executable, "-m", "uni4d_fg.cli.main", "view", str(finished_run), "--port", str(port)]
+    # As a shell starts a background job: deaf to Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"room: http://127.0.0.1:{port} (Ctrl-C ends)\n"
+        assert urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).status == 200
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert (process.returncode, out, error) == (0, "", "")
+
+
+def picture(page: object) -> np.ndarray:
+    import cv2
+
+    data = np.frombuffer(page.screenshot(), np.uint8)  # type: ignore[attr-defined]
+    # The panel at the right changes by itself.
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[:, :440].astype(np.int64)
+
+
+def test_a_browser_shows_the_scene_and_follows_the_slider(finished_run: Path) -> None:
+    port = free_port()
+    with (
+        viewer_server("127.0.0.1", port, "a run") as server,
+        browser_page(viewport={"width": 800, "height": 480}) as page,
+    ):
+        viewer = Viewer(server, opened(finished_run))
+        requested: list[str] = []
+        errors: list[str] = []
+        page.on("request", lambda request: requested.append(request.url))
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(f"http://127.0.0.1:{port}")
+        page.get_by_text("Frames per second").wait_for(timeout=60_000)
+        deadline = time.monotonic() + 40.0
+        while picture(page).std() < 10.0 and time.monotonic() < deadline:
+            time.sleep(0.3)
+        first = picture(page)
+        assert first.std() > 10.0
+        box = page.get_by_role("textbox").locator("visible=true").first
+        box.fill("6")
+        box.press("Enter")
+        page.get_by_text("frame 6").wait_for(timeout=30_000)
+        assert int(viewer.panel.frame.value) == 6
+        while (np.abs(picture(page) - first).max(axis=2) > 40).mean() < 0.002 and time.monotonic() < deadline + 5.0:
+            time.sleep(0.3)
+        assert (np.abs(picture(page) - first).max(axis=2) > 40).mean() > 0.002
+    assert errors == []
+    outside = [url for url in requested if not url.startswith((f"http://127.0.0.1:{port}", "data:", "blob:"))]
+    assert outside == []
+
+
+def test_notes_reach_the_panel(finished_run: Path, tmp_path: Path) -> None:
+    copy = copied(finished_run, tmp_path)
+    summary = json.loads((copy / "summary.json").read_text())
+    (copy / "summary.json").write_text(json.dumps({**summary, "warnings": ["the camera hardly moves"]}))
+    (copy / "labels.npz").unlink()
+    with viewer_server("127.0.0.1", free_port(), "a run") as server:
+        notes = Viewer(server, opened(copy)).panel.notes.content
+    assert "the camera hardly moves" in notes
+    assert "labels.npz" in notes

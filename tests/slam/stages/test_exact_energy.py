@@ -1,0 +1,184 @@
+"""The exact scorer equals sums written out in numpy, and does not see a rigid motion of the world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stage_samples import K, camera_path, hide, observe, shift, static_observations, static_points
+
+from uni4d_fg.config.solver import KernelConfig
+from uni4d_fg.config.stages import CameraMotionConfig, NonRigidConfig
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT
+from uni4d_fg.frontend.track_model import TrackLabel
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import camera_to_world, project, world_to_camera
+from uni4d_fg.pipeline.steps import paper_energy
+from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy
+from uni4d_fg.slam.stages.nonrigid import PointMesh, build_mesh, nonrigid_problem
+from uni4d_fg.slam.stages.observations import Observations, observations_of
+from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
+
+FRAMES, TRACKS = 6, 15
+MOTION = se3.se3_exp(np.array([0.4, -0.3, 0.7, 1.0, -2.0, 0.5]))
+NORMALIZATIONS: list[Normalization] = ["mean", "sum"]
+NOISE = StaticNoise(0.5, 0.02)
+NORM = KernelConfig(kind="norm", threshold=0.1)
+PAPER_NONRIGID = NonRigidConfig(
+    depth_prior=False, smoothness_order=1, smoothness_weight=10.0, arap_weight=100.0, bridge_gaps=False,
+    reprojection_kernel=NORM, smoothness_kernel=NORM, arap_kernel=NORM,
+)  # fmt: skip
+
+
+@pytest.fixture
+def poses(rng: np.random.Generator) -> np.ndarray:
+    return se3.retract(camera_path(FRAMES), rng.normal(scale=0.02, size=(FRAMES, 6)))
+
+
+@pytest.fixture
+def static(rng: np.random.Generator, poses: np.ndarray) -> tuple[np.ndarray, Observations]:
+    """Landmarks and disturbed observations of unequal weight, some missing."""
+    landmarks = static_points(rng, TRACKS)
+    labelled = shift(observe(landmarks, poses), rng.normal(size=(TRACKS, FRAMES, 2)))
+    observations = static_observations(hide(labelled, rng.random((TRACKS, FRAMES)) < 0.3))
+    return landmarks, replace(observations, weight=rng.uniform(0.2, 1.0, len(observations)))
+
+
+def moved(points: np.ndarray) -> np.ndarray:
+    return np.asarray(camera_to_world(MOTION, points))
+
+
+def reprojection(
+    points: np.ndarray, observations: Observations, poses: np.ndarray, normalization: Normalization
+) -> float:
+    """Sum, or mean over frames of weighted means, of the pixel distances; ``points`` (N, 3), one per observation."""
+    x = world_to_camera(poses[observations.frame], points)
+    norms = np.linalg.norm(observations.uv - project(K, x), axis=1)
+    if normalization == "sum":
+        return float(np.sum(observations.weight * norms))
+    means = []
+    for t in range(len(poses)):
+        mine = observations.frame == t
+        means.append(np.average(norms[mine], weights=observations.weight[mine]))
+    return float(np.mean(means))
+
+
+def relative_change(a: np.ndarray, b: np.ndarray, floor: float) -> float:
+    size = 0.5 * (np.sqrt(a @ a + floor**2) + np.sqrt(b @ b + floor**2))
+    return float(np.linalg.norm(a - b) / size)
+
+
+def static_energy(
+    world_T_cam: np.ndarray, landmarks: np.ndarray, observations: Observations, normalization: Normalization
+) -> dict[str, float]:
+    scene = StaticScene(
+        Cameras(world_T_cam, K, np.zeros(len(world_T_cam))), landmarks, observations.rows()[0], observations, NOISE,
+        np.zeros(len(landmarks), np.float32), *unknown_covariances(len(world_T_cam)),
+    )  # fmt: skip
+    return paper_energy(scene, normalization)
+
+
+@pytest.mark.parametrize("normalization", NORMALIZATIONS)
+def test_the_static_energy_written_out(
+    static: tuple[np.ndarray, Observations], poses: np.ndarray, normalization: Normalization
+) -> None:
+    landmarks, observations = static
+    _, row = observations.rows()
+    energy = static_energy(poses, landmarks, observations, normalization)
+    assert energy["static_reprojection"] == pytest.approx(
+        reprojection(landmarks[row], observations, poses, normalization), rel=1e-12
+    )
+    floor = CameraMotionConfig()
+    rotation, translation = [], []
+    for t in range(1, FRAMES - 1):
+        turns = [se3.so3_log(poses[t + i - 1, :3, :3].T @ poses[t + i, :3, :3]) for i in range(2)]
+        steps = [poses[t + i, :3, 3] - poses[t + i - 1, :3, 3] for i in range(2)]
+        rotation.append(relative_change(turns[0], turns[1], floor.rotation_floor_rad))
+        translation.append(relative_change(steps[0], steps[1], floor.translation_floor_m))
+    reduce = np.mean if normalization == "mean" else np.sum
+    assert energy["camera_rotation"] == pytest.approx(reduce(rotation), rel=1e-9)
+    assert energy["camera_translation"] == pytest.approx(reduce(translation), rel=1e-9)
+    assert set(energy) == {"static_reprojection", "camera_rotation", "camera_translation"}
+
+
+@pytest.mark.parametrize("normalization", NORMALIZATIONS)
+def test_the_static_energy_does_not_see_a_rigid_motion(
+    static: tuple[np.ndarray, Observations], poses: np.ndarray, normalization: Normalization
+) -> None:
+    landmarks, observations = static
+    here = static_energy(poses, landmarks, observations, normalization)
+    there = static_energy(MOTION @ poses, moved(landmarks), observations, normalization)
+    assert there == pytest.approx(here, rel=1e-9)
+
+
+def test_the_static_energy_of_the_exact_scene_is_zero_but_for_rounding(rng: np.random.Generator) -> None:
+    landmarks, straight = static_points(rng, TRACKS), np.tile(np.eye(4), (FRAMES, 1, 1))
+    straight[:, 0, 3] = 0.1 * np.arange(FRAMES)
+    energy = static_energy(straight, landmarks, static_observations(observe(landmarks, straight)), "mean")
+    assert energy["static_reprojection"] < 1e-4
+    assert energy["camera_rotation"] + energy["camera_translation"] < 1e-12
+
+
+@pytest.fixture
+def dynamic(rng: np.random.Generator, poses: np.ndarray) -> tuple[State, PointMesh, Observations, np.ndarray, Cameras]:
+    walk = static_points(rng, TRACKS)[:, None] + np.cumsum(rng.normal(scale=0.05, size=(TRACKS, FRAMES, 3)), axis=1)
+    labelled = shift(observe(walk, poses, TrackLabel.DYNAMIC, 1), rng.normal(size=(TRACKS, FRAMES, 2)))
+    labelled = hide(labelled, rng.random((TRACKS, FRAMES)) < 0.2)
+    observations = observations_of(labelled, TrackLabel.DYNAMIC)
+    observations = replace(observations, weight=rng.uniform(0.2, 1.0, len(observations)))
+    cameras = Cameras(poses, K, np.zeros(FRAMES))
+    mesh, observations, rows, state = build_mesh(observations, labelled.instance, FRAMES, cameras, PAPER_NONRIGID, {})
+    disturbed = state[DYNAMIC_POINT] + rng.normal(scale=0.02, size=state[DYNAMIC_POINT].shape)
+    return state.replace({DYNAMIC_POINT: disturbed}), mesh, observations, rows, cameras
+
+
+def dynamic_energy(
+    state: State,
+    mesh: PointMesh,
+    observations: Observations,
+    rows: np.ndarray,
+    cameras: Cameras,
+    normalization: Normalization,
+) -> dict[str, float]:
+    problem = nonrigid_problem(
+        state, mesh, observations, rows, cameras, NOISE, PAPER_NONRIGID, PaperEnergy(normalization)
+    )
+    return problem.energies(state, exact=True)
+
+
+@pytest.mark.parametrize("normalization", NORMALIZATIONS)
+def test_the_dynamic_energy_written_out(
+    dynamic: tuple[State, PointMesh, Observations, np.ndarray, Cameras], normalization: Normalization
+) -> None:
+    state, mesh, observations, rows, cameras = dynamic
+    points = np.full((*mesh.row.shape, 3), np.nan)
+    points[mesh.row >= 0] = state[DYNAMIC_POINT]
+    energy = dynamic_energy(state, mesh, observations, rows, cameras, normalization)
+    assert energy["dynamic_reprojection"] == pytest.approx(
+        reprojection(state[DYNAMIC_POINT][rows], observations, cameras.world_T_cam, normalization), rel=1e-12
+    )
+    steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    steps = steps[np.isfinite(steps)]
+    changes = []
+    for first, second in mesh.pairs:
+        distance = np.sqrt(np.sum((points[first] - points[second]) ** 2, axis=1) + 1e-8)
+        changes += [abs(step) for step in np.diff(distance) if np.isfinite(step)]
+    reduce = np.mean if normalization == "mean" else np.sum
+    assert energy["smoothness"] == pytest.approx(10.0 * reduce(steps), rel=1e-12)
+    assert energy["arap"] == pytest.approx(100.0 * reduce(changes), rel=1e-9)
+    assert set(energy) == {"dynamic_reprojection", "smoothness", "arap"}
+
+
+@pytest.mark.parametrize("normalization", NORMALIZATIONS)
+def test_the_dynamic_energy_does_not_see_a_rigid_motion(
+    dynamic: tuple[State, PointMesh, Observations, np.ndarray, Cameras], normalization: Normalization
+) -> None:
+    state, mesh, observations, rows, cameras = dynamic
+    here = dynamic_energy(state, mesh, observations, rows, cameras, normalization)
+    there = dynamic_energy(
+        state.replace({DYNAMIC_POINT: moved(state[DYNAMIC_POINT])}), mesh, observations, rows,
+        replace(cameras, world_T_cam=MOTION @ cameras.world_T_cam), normalization,
+    )  # fmt: skip
+    assert there == pytest.approx(here, rel=1e-9)

@@ -1,0 +1,240 @@
+"""Stage 2: gauge and scale, what is dropped and counted, and what is measured."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from stage_samples import K, camera_path, hide, observe, shift, static_observations, static_points
+
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
+from uni4d_fg.errors import DegenerateProblemError
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.geometry import se3
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.summary import Termination
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, adjust_bundle
+from uni4d_fg.slam.stages.energy import MAP, Energy, PaperEnergy
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.scene import Cameras, StaticScene
+from uni4d_fg.slam.stages.static_outliers import drop_outliers
+
+FRAMES, TRACKS = 8, 80
+POSES = camera_path(FRAMES)
+WORLD = static_points(np.random.default_rng(11), TRACKS)
+# The path of the samples bends on purpose: no prior on constant velocity, and iterate to the end.
+CONFIG = BundleAdjustmentConfig.model_validate(
+    {
+        "camera_motion": {"rotation_weight": 0.0, "translation_weight": 0.0},
+        "solver": {"max_iterations": 50, "relative_decrease": 1e-9},
+    }
+)
+
+
+def changed(**fields: object) -> BundleAdjustmentConfig:
+    return BundleAdjustmentConfig.model_validate(CONFIG.model_dump() | fields)
+
+
+@pytest.fixture
+def exact() -> LabelledTracks:
+    return observe(WORLD, POSES)
+
+
+@pytest.fixture
+def start(rng: np.random.Generator) -> np.ndarray:
+    """Starting poses off by about 1 cm and 0.3 degrees, but for the first."""
+    disturbed = se3.retract(POSES, rng.normal(scale=[0.005] * 3 + [0.01] * 3, size=(FRAMES, 6)))
+    disturbed[0] = POSES[0]
+    return disturbed
+
+
+def adjust(
+    observations: Observations,
+    start: np.ndarray,
+    config: BundleAdjustmentConfig = CONFIG,
+    *,
+    intrinsics: np.ndarray = K,
+    poses_free: bool = True,
+    intrinsics_free: bool = False,
+    energy: Energy = MAP,
+    hooks: Hooks | None = None,
+) -> StaticScene:
+    cameras = Cameras(start, intrinsics, np.zeros(len(start)))
+    return adjust_bundle(observations, cameras, intrinsics, config, Freedom(poses_free, intrinsics_free), energy, hooks)
+
+
+def test_exact_observations_give_the_exact_scene(exact: LabelledTracks, start: np.ndarray) -> None:
+    result = adjust(static_observations(exact), start)
+    np.testing.assert_allclose(result.cameras.world_T_cam, POSES, atol=1e-4)
+    np.testing.assert_allclose(result.landmarks, WORLD[result.landmark_track], atol=1e-3)
+    np.testing.assert_allclose(result.cameras.log_scale, 0.0, atol=1e-4)
+    assert result.landmark_error.max() < 0.01
+    assert result.noise.reprojection_sigma_px == CONFIG.min_reprojection_sigma_px
+    assert result.noise.depth_sigma == CONFIG.min_depth_sigma
+
+
+@pytest.mark.parametrize("energy", [MAP, PaperEnergy()], ids=["map", "paper"])
+def test_the_first_frame_is_the_gauge_and_stays_exactly(
+    exact: LabelledTracks, start: np.ndarray, rng: np.random.Generator, energy: Energy
+) -> None:
+    noisy = static_observations(shift(exact, rng.normal(size=exact.tracks.uv.shape)))
+    moved = se3.se3_exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -0.5])) @ start
+    result = adjust(noisy, moved, changed(depth_prior=energy.is_likelihood), energy=energy)
+    np.testing.assert_array_equal(result.cameras.world_T_cam[0], moved[0])
+    assert np.abs(result.cameras.world_T_cam[1:] - moved[1:]).max() > 1e-4
+
+
+def test_covariances_come_with_the_cameras(exact: LabelledTracks, start: np.ndarray) -> None:
+    result = adjust(static_observations(exact), start, intrinsics_free=True)
+    assert (result.pose_covariance[0] == 0.0).all()
+    assert (np.linalg.eigvalsh(result.pose_covariance[1:]) > 0.0).all()
+    assert (np.diag(result.intrinsics_covariance)[:2] > 0.0).all()
+    assert (result.intrinsics_covariance[2:] == 0.0).all()
+    paper = adjust(static_observations(exact), start, changed(depth_prior=False), energy=PaperEnergy())
+    assert np.isnan(paper.pose_covariance).all()
+    assert np.isnan(paper.intrinsics_covariance).all()
+
+
+def test_the_scale_of_the_depth_cue_per_frame_is_found(exact: LabelledTracks, start: np.ndarray) -> None:
+    scale = np.array([0.04, -0.05, 0.02, 0.0, -0.03, 0.05, -0.02, -0.01])
+    observations = static_observations(exact)
+    observations.depth[:] *= np.exp(-scale[observations.frame])
+    result = adjust(observations, start, changed(depth_scale_prior_sigma=1.0))
+    np.testing.assert_allclose(
+        result.cameras.log_scale - result.cameras.log_scale.mean(), scale - scale.mean(), atol=2e-3
+    )
+
+
+def test_without_depth_prior_one_distance_holds_the_scale(exact: LabelledTracks) -> None:
+    result = adjust(static_observations(exact), POSES, changed(depth_prior=False, structure="keep"))
+    distance = np.linalg.norm(result.cameras.world_T_cam[:, :3, 3], axis=1)
+    np.testing.assert_allclose(distance[-1], np.linalg.norm(POSES[-1, :3, 3]), rtol=1e-3)
+    np.testing.assert_array_equal(result.cameras.log_scale, 0.0)
+
+
+def test_a_wrong_focal_length_is_corrected_and_fixed_ones_are_kept(exact: LabelledTracks, start: np.ndarray) -> None:
+    wrong = K * [1.05, 1.05, 1.0, 1.0]
+    free = adjust(static_observations(exact), start, intrinsics=wrong, intrinsics_free=True)
+    np.testing.assert_allclose(free.cameras.intrinsics[:2], K[:2], rtol=0.01)
+    np.testing.assert_array_equal(free.cameras.intrinsics[2:], wrong[2:])
+    fixed = adjust(static_observations(exact), start, intrinsics=wrong)
+    np.testing.assert_array_equal(fixed.cameras.intrinsics, wrong)
+
+
+def test_fixed_poses_are_kept_exactly(exact: LabelledTracks, start: np.ndarray) -> None:
+    result = adjust(static_observations(exact), start, poses_free=False)
+    np.testing.assert_array_equal(result.cameras.world_T_cam, start)
+    assert len(result.landmarks) > 0
+
+
+def test_large_errors_are_dropped_and_counted(exact: LabelledTracks) -> None:
+    offset = np.zeros((TRACKS, FRAMES, 2))
+    offset[:30, 5] = [40.0, -25.0]
+    result = adjust(static_observations(shift(exact, offset)), POSES)
+    assert result.dropped["observation with a large reprojection error"] == 30
+    kept = set(zip(result.observations.track.tolist(), result.observations.frame.tolist(), strict=True))
+    assert not kept & {(track, 5) for track in range(30)}
+    np.testing.assert_allclose(result.cameras.world_T_cam, POSES, atol=2e-3)
+
+
+def test_observations_behind_a_camera_are_dropped_and_counted(exact: LabelledTracks) -> None:
+    poses, observations = POSES.copy(), static_observations(exact)
+    poses[5] = poses[5] @ se3.se3_exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    arrays = {POSE: poses, INTRINSICS: K[None], LOG_SCALE: np.zeros((FRAMES, 1)), LANDMARK: WORLD}
+    dropped: dict[str, int] = {}
+    state, kept = drop_outliers(State(arrays, {LANDMARK: np.arange(TRACKS)}), observations, CONFIG, dropped)
+    assert {reason: count for reason, count in dropped.items() if count} == {"observation behind the camera": TRACKS}
+    assert len(state[LANDMARK]) == TRACKS
+    assert len(kept) == TRACKS * (FRAMES - 1)
+    assert 5 not in kept.frame
+
+
+def test_landmarks_that_contradict_the_depth_cue_are_dropped_and_counted(exact: LabelledTracks) -> None:
+    depth = exact.depth.copy()
+    depth[:10] *= 2.5
+    result = adjust(static_observations(dataclasses.replace(exact, depth=depth)), POSES)
+    assert result.dropped["landmark whose depth contradicts the cue"] == 10
+    assert result.landmark_track.min() == 10
+
+
+def test_isolated_landmarks_are_dropped_and_counted(rng: np.random.Generator) -> None:
+    points = static_points(rng, TRACKS)
+    points[0] = [0.0, 0.0, 60.0]
+    result = adjust(static_observations(observe(points, POSES)), POSES)
+    assert result.dropped["landmark far from its neighbours"] >= 1
+    assert 0 not in result.landmark_track
+    assert len(result.landmarks) == len(result.landmark_track) == len(result.landmark_error)
+    np.testing.assert_array_equal(np.unique(result.observations.track), result.landmark_track)
+
+
+def test_tracks_that_are_short_or_without_depth_are_dropped_and_counted(exact: LabelledTracks) -> None:
+    hidden = np.zeros((TRACKS, FRAMES), bool)
+    hidden[:7, 2:] = True
+    depth = exact.depth.copy()
+    depth[10:15] = np.nan
+    labelled = hide(dataclasses.replace(exact, depth=depth), hidden)
+    result = adjust(static_observations(labelled), POSES)
+    assert result.dropped["track with too few observations"] == 7
+    assert result.dropped["track without depth"] == 5
+    assert not set(result.landmark_track.tolist()) & {*range(7), *range(10, 15)}
+
+
+def test_nothing_liftable_is_an_error(exact: LabelledTracks) -> None:
+    none = dataclasses.replace(exact, depth=np.full_like(exact.depth, np.nan))
+    with pytest.raises(DegenerateProblemError, match="no static track has depth in any frame and is seen in 3 frames"):
+        adjust(static_observations(none), POSES)
+
+
+def test_noise_is_measured(exact: LabelledTracks, rng: np.random.Generator) -> None:
+    noisy = shift(exact, rng.normal(scale=0.7, size=exact.tracks.uv.shape))
+    depth = (noisy.depth * np.exp(rng.normal(scale=0.04, size=noisy.depth.shape))).astype(np.float32)
+    result = adjust(static_observations(dataclasses.replace(noisy, depth=depth)), POSES)
+    # Residuals are smaller than the noise by what the landmarks and poses absorb of it.
+    assert 0.7 * 0.7 < result.noise.reprojection_sigma_px < 0.7
+    assert 0.7 * 0.04 < result.noise.depth_sigma < 1.1 * 0.04
+    assert 0.6 * 0.7 < np.median(result.landmark_error) / np.sqrt(2.0 * np.log(2.0)) < 0.7
+
+
+def test_the_error_of_a_landmark_is_the_median_of_its_reprojection_errors(exact: LabelledTracks) -> None:
+    offset = np.zeros((TRACKS, FRAMES, 2))
+    offset[3, :, 0] = [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 7.0]
+    config = changed(structure="keep", measure_noise=False)
+    result = adjust(static_observations(shift(exact, offset)), POSES, config, poses_free=False)
+    error = result.landmark_error[result.landmark_track == 3]
+    assert 0.1 < error[0] < 0.5
+    assert np.delete(result.landmark_error, 3).max() < 0.05
+
+
+def test_relifted_landmarks_are_the_mean_of_the_lifted_depth(exact: LabelledTracks) -> None:
+    depth = exact.depth.copy()
+    depth[4, 3] *= 1.1
+    observations = static_observations(dataclasses.replace(exact, depth=depth))
+    result = adjust(observations, POSES, changed(structure="relift"), poses_free=False)
+    ray = (WORLD[4] - POSES[3, :3, 3]) * 0.1
+    np.testing.assert_allclose(result.landmarks[4], WORLD[4] + ray / FRAMES, atol=1e-3)
+
+
+def test_no_solve_raises_its_energy(exact: LabelledTracks, start: np.ndarray, rng: np.random.Generator) -> None:
+    noisy = shift(exact, rng.normal(scale=1.0, size=exact.tracks.uv.shape))
+    for energy in (MAP, PaperEnergy()):
+        result = adjust(static_observations(noisy), start, intrinsics_free=True, energy=energy)
+        assert len(result.solves) == (4 if energy.is_likelihood else 1)
+        for solve in result.solves:
+            assert solve.final_energy <= solve.initial_energy
+
+
+def test_stopping_skips_the_solves_that_follow(exact: LabelledTracks, start: np.ndarray) -> None:
+    asked = iter(range(100))
+    result = adjust(static_observations(exact), start, hooks=Hooks(should_stop=lambda: next(asked) >= 1))
+    assert [solve.termination for solve in result.solves] == [Termination.CANCELLED]
+
+
+def test_the_motion_prior_alone_places_a_frame_without_tracks(exact: LabelledTracks) -> None:
+    config = changed(camera_motion=CameraMotionConfig(rotation_weight=1.0, translation_weight=1.0).model_dump())
+    result = adjust(static_observations(hide(exact, np.arange(FRAMES) == 4)), POSES, config)
+    middle = 0.5 * (result.cameras.world_T_cam[3, :3, 3] + result.cameras.world_T_cam[5, :3, 3])
+    step = np.linalg.norm(result.cameras.world_T_cam[5, :3, 3] - result.cameras.world_T_cam[3, :3, 3])
+    assert np.linalg.norm(result.cameras.world_T_cam[4, :3, 3] - middle) < 0.25 * step

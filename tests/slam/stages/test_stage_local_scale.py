@@ -1,0 +1,90 @@
+"""The depth cue's scale at moving points: the neighbourhood is used exactly where it predicts better."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uni4d_fg.slam.stages.local_scale import predict_log_scale
+from uni4d_fg.slam.stages.observations import Observations
+
+FRAMES, PER_FRAME = 4, 400
+FRAME_SCALE = np.array([0.05, -0.1, 0.0, 0.2])
+
+
+def scattered(rng: np.random.Generator, per_frame: int) -> Observations:
+    frame = np.repeat(np.arange(FRAMES), per_frame)
+    count = len(frame)
+    uv = rng.uniform([0, 0], [320, 240], size=(count, 2))
+    return Observations(np.arange(count), frame, uv, np.ones(count), np.ones(count))
+
+
+def smooth_field(observations: Observations) -> np.ndarray:
+    """A field over the image, another one in each frame."""
+    u, v = (observations.uv / [320.0, 240.0]).T
+    return 0.04 * np.sin(4.0 * u + observations.frame) + 0.03 * np.cos(3.0 * v - 2.0 * observations.frame)
+
+
+def test_a_smooth_field_is_predicted_better_than_by_the_frame(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, PER_FRAME), scattered(rng, 50)
+    measured = FRAME_SCALE[static.frame] + smooth_field(static) + rng.normal(scale=0.01, size=len(static))
+    local = predict_log_scale(static, measured, FRAME_SCALE, queries, 24, 512)
+    truth = FRAME_SCALE[queries.frame] + smooth_field(queries)
+    error = local.log_scale - truth
+    frame_error = FRAME_SCALE[queries.frame] - truth
+    assert local.is_local
+    assert local.sigma == pytest.approx(0.011, abs=0.002)
+    assert local.frame_sigma > 0.03
+    assert np.sqrt(np.mean(error**2)) < 0.25 * np.sqrt(np.mean(frame_error**2))
+
+
+def test_many_static_observations_are_measured_on_a_sample(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, 4000), scattered(rng, 50)
+    measured = FRAME_SCALE[static.frame] + smooth_field(static) + rng.normal(scale=0.01, size=len(static))
+    local = predict_log_scale(static, measured, FRAME_SCALE, queries, 24, 512)
+    assert local.sigma == pytest.approx(0.01 * np.sqrt(1.0 + 0.5 * np.pi / 24), rel=0.05)  # a median of 24
+    assert local.frame_sigma > 0.03
+
+
+def test_white_noise_falls_back_to_the_scale_of_the_frame(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, PER_FRAME), scattered(rng, 50)
+    measured = FRAME_SCALE[static.frame] + rng.normal(scale=0.02, size=len(static))
+    local = predict_log_scale(static, measured, FRAME_SCALE, queries, 24, 512)
+    assert not local.is_local
+    np.testing.assert_array_equal(local.log_scale, FRAME_SCALE[queries.frame])
+    assert local.sigma == local.frame_sigma == pytest.approx(0.02, rel=0.1)
+
+
+def test_no_neighbours_means_the_scale_of_the_frame(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, PER_FRAME), scattered(rng, 10)
+    local = predict_log_scale(static, smooth_field(static), FRAME_SCALE, queries, 0, 512)
+    np.testing.assert_array_equal(local.log_scale, FRAME_SCALE[queries.frame])
+    assert not local.is_local
+
+
+def test_a_frame_with_too_few_static_observations_keeps_its_scale(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, PER_FRAME), scattered(rng, 20)
+    measured = FRAME_SCALE[static.frame] + smooth_field(static)
+    measured[(static.frame == 2) & (np.arange(len(static)) % PER_FRAME >= 10)] = np.nan
+    local = predict_log_scale(static, measured, FRAME_SCALE, queries, 24, 512)
+    assert local.is_local
+    sparse = queries.frame == 2
+    np.testing.assert_array_equal(local.log_scale[sparse], FRAME_SCALE[2])
+    assert (local.log_scale[~sparse] != FRAME_SCALE[queries.frame[~sparse]]).all()
+
+
+def test_outliers_among_the_static_observations_hardly_matter(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, PER_FRAME), scattered(rng, 50)
+    measured = FRAME_SCALE[static.frame] + smooth_field(static)
+    measured[rng.random(len(static)) < 0.1] += 1.0
+    local = predict_log_scale(static, measured, FRAME_SCALE, queries, 24, 512)
+    error = local.log_scale - FRAME_SCALE[queries.frame] - smooth_field(queries)
+    assert local.is_local
+    assert np.sqrt(np.mean(error**2)) < 0.015
+    assert np.isfinite(local.log_scale).all()
+
+
+def test_no_queries_give_no_prediction(rng: np.random.Generator) -> None:
+    static = scattered(rng, 100)
+    none = static.select(np.zeros(0, np.int64))
+    assert predict_log_scale(static, smooth_field(static), FRAME_SCALE, none, 24, 512).log_scale.shape == (0,)

@@ -1,5 +1,0 @@
-"""The finished run that the tests look at."""
-
-from viewing_samples import finished_run
-
-__all__ = ["finished_run"]

@@ -1,0 +1,27 @@
+"""Every factor type of the package: importing this module declares them all."""
+
+from uni4d_fg.factors.arap import arap
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.depth_prior import dynamic_depth_prior, static_depth_prior
+from uni4d_fg.factors.depth_reprojection import depth_reprojection
+from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection
+from uni4d_fg.factors.priors import aspect_prior, intrinsics_prior, log_scale_prior, scale_anchor
+from uni4d_fg.factors.static_reprojection import static_reprojection
+from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness, velocity_smoothness
+
+__all__ = [
+    "acceleration_smoothness",
+    "arap",
+    "aspect_prior",
+    "camera_rotation",
+    "camera_translation",
+    "depth_reprojection",
+    "dynamic_depth_prior",
+    "dynamic_reprojection",
+    "intrinsics_prior",
+    "log_scale_prior",
+    "scale_anchor",
+    "static_depth_prior",
+    "static_reprojection",
+    "velocity_smoothness",
+]

@@ -1,0 +1,74 @@
+"""The variables of the reconstruction.
+
+| variable | key | value | tangent |
+|---|---|---|---|
+| ``POSE`` | x(frame) | (4, 4) ``world_T_cam`` | 6: body-frame (omega [rad], v [m]), ``T Exp(xi)`` |
+| ``INTRINSICS`` | k(camera) | (4,) fx, fy, cx, cy, px | 4 |
+| ``LOG_SCALE`` | s(frame) | (1,) log-scale of a frame's depth cue | 1 |
+| ``LANDMARK`` | l(track) | (3,) world, m | 3 |
+| ``DYNAMIC_POINT`` | p(track, frame) | (3,) world, m | 3 |
+| ``OBJECT_POSE`` | o(instance, frame) | (4, 4) ``world_T_object`` | 6: body-frame (omega [rad], v [m]) |
+| ``OBJECT_POINT`` | q(track) | (3,) in the object's frame, m | 3 |
+| ``VELOCITY`` | v(frame) | (3,) of the camera, world axes, m/s | 3 |
+| ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s] | 6 |
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.factors.variable import SE3, VariableType, vector_space
+
+CALIBRATION_COLUMNS = (0, 1, 3, 4)
+"""Where fx, fy, cx, cy stand in the vector of a ``gtsam.Cal3_S2``; entry 2 is the skew."""
+
+
+def calibration(intrinsics: FloatArray) -> gtsam.Cal3_S2:
+    """Return intrinsics (4,) as GTSAM's pinhole without skew."""
+    fx, fy, cx, cy = intrinsics.tolist()
+    return gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
+
+
+def _at_pose(values: gtsam.Values, key: int) -> FloatArray:
+    return np.asarray(values.atPose3(key).matrix(), dtype=np.float64)
+
+
+def _at_calibration(values: gtsam.Values, key: int) -> FloatArray:
+    return np.asarray(values.atCal3_S2(key).vector(), dtype=np.float64)[list(CALIBRATION_COLUMNS)]
+
+
+def _at_point(values: gtsam.Values, key: int) -> FloatArray:
+    return np.asarray(values.atPoint3(key), dtype=np.float64)
+
+
+def _at_bias(values: gtsam.Values, key: int) -> FloatArray:
+    return np.asarray(values.atConstantBias(key).vector(), dtype=np.float64)
+
+
+def pose_variable(name: str, symbol: str, index: tuple[str, ...] = ("frame",), label: str = "") -> VariableType:
+    """Declare a variable that is a rigid transform, a ``gtsam.Pose3``."""
+    return VariableType(name, symbol, SE3, index, label, to_gtsam=gtsam.Pose3, from_gtsam=_at_pose)
+
+
+def point_variable(name: str, symbol: str, index: tuple[str, ...] = ("track",), label: str = "") -> VariableType:
+    """Declare a variable that is a 3-vector, a ``gtsam.Point3``."""
+    return VariableType(name, symbol, vector_space(3), index, label, from_gtsam=_at_point)
+
+
+POSE = pose_variable("pose", "x", label="camera pose")
+INTRINSICS = VariableType(
+    "intrinsics", "k", vector_space(4), ("camera",),
+    to_gtsam=calibration, from_gtsam=_at_calibration, gtsam_columns=CALIBRATION_COLUMNS, gtsam_dim=5,
+)  # fmt: skip
+LOG_SCALE = VariableType("log_scale", "s", vector_space(1), label="depth log-scale")
+LANDMARK = point_variable("landmark", "l")
+DYNAMIC_POINT = point_variable("dynamic_point", "p", ("track", "frame"))
+OBJECT_POSE = pose_variable("object_pose", "o", ("instance", "frame"))
+OBJECT_POINT = point_variable("object_point", "q")
+VELOCITY = point_variable("velocity", "v", ("frame",))
+IMU_BIAS = VariableType(
+    "imu_bias", "b", vector_space(6), label="IMU bias",
+    to_gtsam=lambda value: gtsam.imuBias.ConstantBias(value[:3], value[3:]), from_gtsam=_at_bias,
+)  # fmt: skip

@@ -1,0 +1,234 @@
+"""From files to a :class:`Sequence`, with the structural checks that are cheap."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
+from uni4d_fg.files import load_npz
+from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, load_intrinsics
+from uni4d_fg.frontend.sequence.decode import check_bit_depth
+from uni4d_fg.frontend.sequence.frames import DepthFolder, ImageFolder, LazyFrames, MaskFolder, NpyDepth, no_masks
+from uni4d_fg.frontend.sequence.layout import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MASK_SUFFIXES, SequenceFiles, list_frames
+from uni4d_fg.frontend.sequence.model import GroundTruth, Sequence, Video
+from uni4d_fg.frontend.sequence.poses import load_poses, load_timestamps
+from uni4d_fg.frontend.sequence.problems import SequenceProblem
+from uni4d_fg.frontend.sequence.selection import MIN_FRAMES
+from uni4d_fg.frontend.sequence.track_files import RawTracks, load_native_tracks, load_uni4d_tracks
+from uni4d_fg.frontend.sequence.video import VideoFrames
+
+
+def open_images(path: Path, stop: int | None = None) -> ImageFolder | VideoFrames:
+    """Open a folder of images or a video file; decodes the first frame. Raises InputError.
+
+    Args:
+        path: The folder or file.
+        stop: Frames of a video file from this one on are not looked at.
+    """
+    if path.is_file():
+        return VideoFrames(path, stop)
+    paths = list_frames(path, IMAGE_SUFFIXES)
+    images = ImageFolder(paths)
+    check_bit_depth(paths[0])
+    return images
+
+
+def open_depth(path: Path, size: tuple[int, int] | None, units_per_metre: float = 1000.0) -> DepthFolder | NpyDepth:
+    """Open a folder of depth maps or one ``.npy`` file of images of ``size``. Raises InputError."""
+    if path.is_file():
+        return NpyDepth(path, size)
+    return DepthFolder(list_frames(path, DEPTH_SUFFIXES), size, units_per_metre)
+
+
+def open_masks(path: Path, size: tuple[int, int] | None) -> MaskFolder:
+    """Open a folder of label maps of images of ``size``. Raises InputError."""
+    return MaskFolder(list_frames(path, MASK_SUFFIXES), size)
+
+
+def check_count(path: Path, found: int, expected: int) -> None:
+    """Raise InputError unless a cue has as many frames as there are images."""
+    if found != expected:
+        raise SequenceProblem(path, f"has {found} frames, but there are {expected} images", "give one per image")
+
+
+def check_length(path: Path, num_frames: int) -> None:
+    """Raise InputError if the video is too short to move in."""
+    if num_frames < MIN_FRAMES:
+        raise SequenceProblem(path, f"has {num_frames} frame(s)", f"give at least {MIN_FRAMES}")
+
+
+def load_tracks(files: SequenceFiles, path: Path) -> RawTracks:
+    """Read the tracks of either layout. Raises InputError."""
+    return load_native_tracks(path) if files.layout == "native" else load_uni4d_tracks(path)
+
+
+def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> GroundTruth:
+    """Read ``ground_truth.npz``: what it holds of intrinsics, track points and the poses of rigid objects.
+
+    Args:
+        path: The file.
+        num_tracks: K of the sequence's own tracks, or None without tracks.
+        num_frames: T.
+
+    Returns:
+        The truth, without camera poses and depths, which have files of their own.
+
+    Raises:
+        InputError: If the file cannot be read or a shape does not match the sequence.
+    """
+    arrays = load_npz(path, {}, {"intrinsics": 1, "track_points": 3, "rigid_instance": 1, "world_T_object": 4})
+    intrinsics, points = arrays.get("intrinsics"), arrays.get("track_points")
+    instance, poses = arrays.get("rigid_instance"), arrays.get("world_T_object")
+    if intrinsics is not None:
+        valid = intrinsics.shape == (4,) and bool(np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all())
+        if not valid:
+            raise SequenceProblem(
+                path, "intrinsics are not fx, fy, cx, cy with positive focal lengths", "save them as (4,)"
+            )
+        intrinsics = intrinsics.astype(np.float64)
+    if points is not None:
+        if num_tracks is None or points.shape != (num_tracks, num_frames, 3):
+            expected = "there are no tracks" if num_tracks is None else f"({num_tracks}, {num_frames}, 3) is expected"
+            raise SequenceProblem(
+                path,
+                f"track_points has shape {points.shape}, but {expected}",
+                "save one path per track, or none",
+            )
+        points = points.astype(np.float64)
+    if instance is not None or poses is not None:
+        if instance is None or poses is None or poses.shape != (len(instance), num_frames, 4, 4):
+            raise SequenceProblem(
+                path,
+                f"rigid_instance and world_T_object do not fit each other and the {num_frames} frames",
+                "save mask ids (J,) and poses (J, T, 4, 4)",
+            )
+        instance, poses = instance.astype(np.int32), poses.astype(np.float64)
+    return GroundTruth(intrinsics=intrinsics, track_points=points, rigid_instance=instance, world_T_object=poses)
+
+
+def frame_names(images: ImageFolder | VideoFrames) -> tuple[str, ...]:
+    """Return the stems of the image files, or five-digit frame numbers for a video."""
+    if isinstance(images, VideoFrames):
+        return tuple(f"{frame:05d}" for frame in range(len(images)))
+    return tuple(path.stem for path in images.paths)
+
+
+def default_timestamps(images: ImageFolder | VideoFrames) -> FloatArray:
+    """Return (T,) seconds as the video file has them, else by its frame rate, else frame indices."""
+    if not isinstance(images, VideoFrames):
+        return np.arange(len(images), dtype=np.float64)
+    if images.times is not None:
+        return images.times
+    return np.arange(len(images), dtype=np.float64) / (images.frame_rate or 1.0)
+
+
+def assemble(files: SequenceFiles) -> Sequence:
+    """Read everything but the frames themselves; of these only the first is decoded.
+
+    Masks that are absent call everything static; intrinsics that are absent are guessed.
+
+    Raises:
+        InputError: With the first thing found wrong, or if there is no depth.
+    """
+    for problem in files.problems:
+        raise problem
+    if files.no_depth is not None:
+        raise files.no_depth
+    return as_sequence(assemble_video(files))
+
+
+def as_sequence(video: Video) -> Sequence:
+    """Return a video with depth as a sequence; absent masks call everything static, absent intrinsics are guessed.
+
+    Raises:
+        InputError: If it has no depth.
+    """
+    if video.depths is None:
+        raise SequenceProblem(video.root or video.name, "has no depth", "add a depth cue")
+    size, num_frames = video.image_size, video.num_frames
+    return Sequence(
+        name=video.name,
+        images=video.images,
+        depths=video.depths,
+        masks=no_masks(size, num_frames) if video.masks is None else video.masks,
+        intrinsics=guess_intrinsics(size) if video.intrinsics is None else video.intrinsics,
+        image_size=size,
+        timestamps=video.timestamps,
+        root=video.root,
+        frame_names=video.frame_names,
+        initial_world_T_cam=video.initial_world_T_cam,
+        tracks=video.tracks,
+        ground_truth=video.ground_truth,
+    )
+
+
+def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
+    """Read everything that is there but the frames themselves; of these only the first is decoded.
+
+    Args:
+        files: What to read.
+        stop: Frames of a video file from this one on are not looked at; only if nothing else has one per frame.
+
+    Raises:
+        InputError: With the first thing found wrong.
+    """
+    for problem in files.problems:
+        raise problem
+    assert files.images is not None  # else it is in problems
+    images = open_images(files.images, stop)
+    num_frames, size = len(images), images.size
+    check_length(files.images, num_frames)
+    depths: LazyFrames[Float32Array] | None = None
+    if files.depth is not None:
+        depths = open_depth(files.depth, size)
+        check_count(files.depth, len(depths), num_frames)
+        depths[0]
+    masks: LazyFrames[Int32Array] | None = None
+    if files.masks is not None:
+        masks = open_masks(files.masks, size)
+        check_count(files.masks, len(masks), num_frames)
+        masks[0]
+    tracks = None
+    if files.tracks is not None:
+        tracks = load_tracks(files, files.tracks).to_tracks(num_frames, size)
+    root = files.root.resolve()
+    return Video(
+        name=root.stem if root.is_file() else root.name,
+        images=images,
+        image_size=size,
+        timestamps=(
+            default_timestamps(images) if files.timestamps is None else load_timestamps(files.timestamps, num_frames)
+        ),
+        depths=depths,
+        masks=masks,
+        intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
+        tracks=tracks,
+        root=files.root,
+        frame_names=frame_names(images),
+        initial_world_T_cam=None if files.initial_poses is None else load_poses(files.initial_poses, num_frames),
+        ground_truth=_assemble_truth(files, num_frames, size, None if tracks is None else tracks.num_tracks),
+    )
+
+
+def _assemble_truth(
+    files: SequenceFiles, num_frames: int, size: tuple[int, int], num_tracks: int | None
+) -> GroundTruth:
+    depths = None
+    if files.true_depth is not None:
+        depths = open_depth(files.true_depth, size, files.true_depth_units_per_metre)
+        check_count(files.true_depth, len(depths), num_frames)
+        depths[0]
+    truth = GroundTruth()
+    if files.ground_truth is not None:
+        truth = load_ground_truth(files.ground_truth, num_tracks, num_frames)
+    elif files.true_intrinsics is not None:
+        try:
+            truth = GroundTruth(intrinsics=load_intrinsics(files.true_intrinsics, num_frames, size))
+        except VaryingIntrinsics:
+            # One camera cannot be compared with a zoom; the rest of the sequence is still of use.
+            truth = GroundTruth()
+    poses = None if files.true_poses is None else load_poses(files.true_poses, num_frames)
+    return replace(truth, world_T_cam=poses, depths=depths)

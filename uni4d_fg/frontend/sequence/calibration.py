@@ -1,0 +1,99 @@
+"""Camera intrinsics from 3 x 3 matrices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.files import load_npy
+from uni4d_fg.frontend.sequence.problems import SequenceProblem
+
+MAX_VARIATION = 0.01
+"""Per-frame matrices must agree to this part of the focal length (and of the image size, for the centre)."""
+MAX_SKEW = 1e-3
+"""Largest skew, as a part of the focal length, that is taken for zero."""
+
+
+class VaryingIntrinsics(SequenceProblem):
+    """The intrinsics change along the video (zoom), which one shared camera cannot express."""
+
+
+def guess_intrinsics(size: tuple[int, int]) -> FloatArray:
+    """Return (4,) fx, fy, cx, cy, px: focal length of the longer side, principal point in the centre."""
+    height, width = size
+    focal = float(max(size))
+    return np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
+
+
+def intrinsics_matrix(intrinsics: FloatArray) -> FloatArray:
+    """Return the (3, 3) matrix of (4,) fx, fy, cx, cy."""
+    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> FloatArray:
+    """Read the shared intrinsics of a video.
+
+    Args:
+        path: ``.npy`` file of one (3, 3) matrix or of (T, 3, 3), whose mean is taken.
+        num_frames: T.
+        size: (height, width), px.
+
+    Returns:
+        (4,) fx, fy, cx, cy, px.
+
+    Raises:
+        VaryingIntrinsics: If the frames' matrices differ by more than 1 %.
+        InputError: If the file cannot be read or does not hold pinhole matrices without skew.
+    """
+    values = load_npy(path).astype(np.float64)
+    if values.ndim not in (2, 3) or values.shape[-2:] != (3, 3) or values.size == 0:
+        raise SequenceProblem(path, f"has shape {values.shape}", "save one (3, 3) matrix, or (T, 3, 3)")
+    matrices = values.reshape(-1, 3, 3)
+    if len(matrices) not in (1, num_frames):
+        raise SequenceProblem(
+            path,
+            f"has {len(matrices)} matrices for {num_frames} frames",
+            "save one (3, 3) matrix, or one per frame",
+        )
+    if not np.isfinite(matrices).all():
+        raise SequenceProblem(path, "has NaN or infinite entries", "save the calibration again")
+    focal = matrices[:, (0, 1), (0, 1)]
+    if (focal <= 0).any():
+        raise SequenceProblem(
+            path, f"has a focal length of {focal.min():g} px", "save positive focal lengths in pixels"
+        )
+    below = matrices[:, (1, 2, 2, 2), (0, 0, 1, 2)] - np.array([0.0, 0.0, 0.0, 1.0])
+    if np.abs(below).max() > 1e-6:
+        raise SequenceProblem(path, "is not a pinhole matrix", "save [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
+    skew = np.abs(matrices[:, 0, 1]).max()
+    if skew > MAX_SKEW * focal.min():
+        raise SequenceProblem(path, f"has a skew of {skew:g} px", "rectify the images; skew is not modelled")
+    per_frame = np.concatenate((focal, matrices[:, :2, 2]), axis=1)
+    mean: FloatArray = per_frame.mean(axis=0)
+    variation = np.abs(per_frame - mean) / np.array([mean[0], mean[1], max(size), max(size)])
+    if variation.max() > MAX_VARIATION:
+        frame = int(variation.max(axis=1).argmax())
+        raise VaryingIntrinsics(
+            path,
+            f"changes along the video (frame {frame} is {100 * variation.max():.1f} % from the mean)",
+            "split the video where the zoom changes; one camera is shared by all frames",
+        )
+    return mean
+
+
+def implausible(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
+    """Say what is odd about (4,) intrinsics for images of ``size`` (height, width), or return None."""
+    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    height, width = size
+    if not (0 <= cx < width and 0 <= cy < height):
+        return f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px"
+    if abs(cx - (width - 1) / 2) > 0.25 * width or abs(cy - (height - 1) / 2) > 0.25 * height:
+        return f"principal point ({cx:.1f}, {cy:.1f}) is far from the centre of the {width} x {height} px image"
+    if not 0.2 * width < fx < 10 * width:
+        return f"focal length {fx:.1f} px is unusual for an image {width} px wide"
+    if not 0.8 < fx / fy < 1.25:
+        return f"focal lengths {fx:.1f} and {fy:.1f} px differ by more than 25 %"
+    return None

@@ -1,0 +1,132 @@
+"""The one description of a video and its cues, whatever folder layout it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
+from uni4d_fg.frontend.track_model import Tracks
+
+T_co = TypeVar("T_co", covariant=True)
+
+
+@runtime_checkable
+class FrameSource(Protocol[T_co]):
+    """A lazily read list of per-frame arrays: nothing is decoded until it is indexed."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, frame: int) -> T_co: ...
+
+    def __iter__(self) -> Iterator[T_co]: ...
+
+
+@dataclass(frozen=True)
+class ArrayFrames:
+    """In-memory frames (or a memory map) with the interface of :class:`FrameSource`."""
+
+    array: np.ndarray  # (T, ...)
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def __getitem__(self, frame: int) -> np.ndarray:
+        return np.asarray(self.array[frame])
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (np.asarray(a) for a in self.array)
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """What is known of the truth; every field may be absent. Used by evaluation only, never by the solver."""
+
+    world_T_cam: FloatArray | None = None
+    """(T, 4, 4) camera to world, OpenCV axes, metres."""
+    depths: FrameSource[Float32Array] | None = None
+    """T maps (H, W), metres; NaN where unknown."""
+    intrinsics: FloatArray | None = None
+    """(4,) fx, fy, cx, cy, px."""
+    track_points: FloatArray | None = None
+    """(K, T, 3) world position of each of the sequence's own tracks, metres; NaN where unknown."""
+    rigid_instance: Int32Array | None = None
+    """(J,) mask ids of the instances that move rigidly."""
+    world_T_object: FloatArray | None = None
+    """(J, T, 4, 4) their poses, metres; the origin and axes of an object's frame are arbitrary, but fixed to it."""
+
+
+@dataclass(frozen=True)
+class Video:
+    """What came in: frames, and the cues that came with them; :mod:`uni4d_fg.cues` makes those that are missing.
+
+    Conventions as in :class:`Sequence`.
+    """
+
+    name: str
+    images: FrameSource[ImageArray]
+    """T images (H, W, 3), uint8 RGB, upright."""
+    image_size: tuple[int, int]
+    """(height, width), px."""
+    timestamps: FloatArray
+    """(T,) seconds, strictly increasing; frame index when unknown."""
+    depths: FrameSource[Float32Array] | None = None
+    """T maps (H, W), float32 metres, NaN where missing."""
+    masks: FrameSource[Int32Array] | None = None
+    """T label maps (H, W), int32."""
+    intrinsics: FloatArray | None = None
+    """(4,) fx, fy, cx, cy in px."""
+    tracks: Tracks | None = None
+    root: Path | None = None
+    """Folder or file it was read from, if any."""
+    frame_names: tuple[str, ...] = ()
+    """T stems used to name per-frame outputs."""
+    initial_world_T_cam: FloatArray | None = None
+    """(T, 4, 4)."""
+    ground_truth: GroundTruth = field(default_factory=GroundTruth)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames T."""
+        return len(self.images)
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """One video with all its cues.
+
+    Conventions: pixel centres at integers; depth is z-depth in metres, NaN where missing (readers turn
+    zero, negative and infinite values into NaN); mask 0 is static and > 0 an instance that may move.
+    """
+
+    name: str
+    images: FrameSource[ImageArray]
+    """T images (H, W, 3), uint8 RGB."""
+    depths: FrameSource[Float32Array]
+    """T maps (H, W), float32 metres, NaN where missing."""
+    masks: FrameSource[Int32Array]
+    """T label maps (H, W), int32."""
+    intrinsics: FloatArray
+    """(4,) fx, fy, cx, cy in px: known, or an initial value when the config frees them."""
+    image_size: tuple[int, int]
+    """(height, width), px."""
+    timestamps: FloatArray
+    """(T,) seconds, strictly increasing; frame index when unknown."""
+    root: Path | None = None
+    """Folder it was read from, if any."""
+    frame_names: tuple[str, ...] = ()
+    """T stems of the image files ("00000", ...), used to name per-frame outputs."""
+    initial_world_T_cam: FloatArray | None = None
+    """(T, 4, 4) poses to start from or to keep, as the config says."""
+    tracks: Tracks | None = None
+    """Long 2D point tracks, when the sequence brings them."""
+    ground_truth: GroundTruth = field(default_factory=GroundTruth)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames T."""
+        return len(self.images)

@@ -1,0 +1,85 @@
+"""Tracks of a sequence: its own, or remembered ones, or new ones."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from uni4d_fg.arrays import ImageArray
+from uni4d_fg.config.cues import TrackingConfig
+from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
+from uni4d_fg.frontend.tracks.lucas_kanade import Progress, ShouldStop, track_grid
+
+TRACKER_VERSION = 2
+"""Part of the cache key; raised whenever the tracker gives other tracks for the same input."""
+
+
+def cache_key(images: FrameSource[ImageArray], config: TrackingConfig, should_stop: ShouldStop | None = None) -> str:
+    """Return a hexadecimal key that changes with the tracker, its configuration or any pixel of any image.
+
+    Raises:
+        Cancelled: If ``should_stop`` said so.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    digest.update(f"{TRACKER_VERSION} {len(images)} {config.model_dump_json()}".encode())
+    for image in images:
+        if should_stop is not None and should_stop():
+            raise Cancelled("tracking stopped while looking for remembered tracks")
+        digest.update(f"{image.shape} {image.dtype}".encode())
+        digest.update(np.ascontiguousarray(image).data)
+    return digest.hexdigest()
+
+
+def load_or_track(
+    sequence: Sequence | Video,
+    config: TrackingConfig,
+    cache_dir: Path | None,
+    progress: Progress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Tracks:
+    """Return the tracks of a sequence, tracking only if there is no other way.
+
+    Args:
+        sequence: Its own tracks are used if it brings any.
+        config: Built-in tracker.
+        cache_dir: Folder of ``tracks-<key>.npz`` files; None remembers nothing. An unreadable file is replaced.
+        progress: Told the tracking steps done and to do.
+        should_stop: Asked before every step.
+
+    Raises:
+        InputError: If the images cannot be tracked, or the sequence's tracks have another length than it.
+        OutputError: If the cache file cannot be written.
+        Cancelled: If ``should_stop`` said so.
+    """
+    if sequence.tracks is not None:
+        if sequence.tracks.num_frames != sequence.num_frames:
+            raise InputError(
+                f"tracks of {sequence.name} cover {sequence.tracks.num_frames} frames, "
+                f"the sequence has {sequence.num_frames}"
+            )
+        return sequence.tracks
+    if cache_dir is None:
+        return track_grid(sequence.images, config, progress, should_stop)
+    path = cache_dir / f"tracks-{cache_key(sequence.images, config, should_stop)}.npz"
+    remembered = _remembered(path, sequence.num_frames)
+    if remembered is not None:
+        return remembered
+    tracks = track_grid(sequence.images, config, progress, should_stop)
+    save_tracks(path, tracks)
+    return tracks
+
+
+def _remembered(path: Path, num_frames: int) -> Tracks | None:
+    """Return the tracks in a cache file, or None if it is absent or not to be believed."""
+    if not path.exists():
+        return None
+    try:
+        tracks = load_tracks(path)
+    except InputError:
+        return None
+    return tracks if tracks.num_frames == num_frames else None

@@ -1,1 +1,0 @@
-"""Variables and their GTSAM keys, and problems made of factor batches."""

@@ -1,0 +1,71 @@
+"""From a video or a sequence to a result in one call, as the command line does it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.gather import gather_cues
+from uni4d_fg.cues.plan import plan_cues
+from uni4d_fg.frontend.sequence import model
+from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.open_video import open_video
+from uni4d_fg.optim.added_factors import FactorSource
+from uni4d_fg.pipeline.run import reconstruct as reconstruct_sequence
+from uni4d_fg.progress import Reporter
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.reconstruction import Reconstruction
+
+
+def reconstruct(
+    source: str | Path | model.Sequence,
+    run: str | Path,
+    config: Config | str | Path | None = None,
+    changes: Sequence[str] = (),
+    *,
+    additions: Iterable[FactorSource] = (),
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> Reconstruction:
+    """Reconstruct a video and write the run folder; cues that it does not bring are made.
+
+    Args:
+        source: Video file, folder of images, sequence folder, or an opened sequence with all its cues.
+        run: Folder of the run, made if absent.
+        config: A configuration, the name of a preset, or a YAML file; the default preset when None.
+        changes: ``section.field=VALUE``, as ``--set`` of the command line; not with an opened configuration.
+        additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`.
+        resume: Take over stages of the folder whose input and configuration are the same.
+        reporter: Progress.
+
+    Returns:
+        Cameras, static points and trajectories; depth and clouds are in the folder.
+
+    Raises:
+        Uni4dFgError: If the input cannot be read, the cues do not determine the cameras, or a file cannot be written;
+            the message says what, where and what to do.
+    """
+    folder = Path(run)
+    settings = config if isinstance(config, Config) else load_config(config, changes)
+    report = None
+    if isinstance(source, model.Sequence):
+        sequence = source
+    else:
+        path = Path(source)
+        video = open_video(path)
+        plan = plan_cues(video, bare=path.is_file() or video.depths is None)
+        if plan.is_given:
+            sequence = as_sequence(replace(video, masks=None) if plan.masks == "none" else video)
+        else:
+            plan.check()
+            sequence, report = gather_cues(
+                video, plan, folder / "cues", settings, reporter=reporter, track_cache=folder / "stages"
+            )
+            settings = report.settings or settings
+    cues = None if report is None else report.to_dict()
+    reconstruct_sequence(sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions)
+    return load_reconstruction(RunFolder(folder).reconstruction)

@@ -1,0 +1,140 @@
+"""Solve a sequence as a stream, into a run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.config.load import dump_config
+from uni4d_fg.config.models import Config
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.files import atomic_write_json, atomic_write_text
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.pipeline.assemble import write_result
+from uni4d_fg.pipeline.checks import check_sequence
+from uni4d_fg.pipeline.leftovers import remove_leftovers
+from uni4d_fg.pipeline.stream_folder import StreamFolder
+from uni4d_fg.pipeline.summary import peak_memory_mb, versions
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
+from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor
+
+OnFrame = Callable[[FrameUpdate], None]
+"""Told of every frame."""
+
+
+@dataclass
+class StreamSummary:
+    """What a stream did, as written to ``summary.json``."""
+
+    name: str
+    num_frames: int
+    resumed_from: int
+    counts: dict[str, int]
+    """Frames of this process per status."""
+    seconds: dict[str, float]
+    """Of this process, per part and in all."""
+    peak_memory_mb: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return {
+            "sequence": {"name": self.name, "num_frames": self.num_frames},
+            "stages": {"stream": {**self.__dict__, "name": "stream"}},
+            "warnings": self.warnings(),
+            "versions": versions(),
+        }
+
+    def warnings(self) -> list[str]:
+        """Return what to distrust."""
+        bridged = self.counts.get(FrameStatus.BRIDGED.value, 0)
+        return [f"{bridged} frame(s) had too few static tracks and are bridged by constant velocity"] if bridged else []
+
+    def lines(self) -> list[str]:
+        """Return a few lines of text."""
+        done = sum(self.counts.values())
+        rate = done / max(self.seconds.get("total", 0.0), 1e-9)
+        parts = ", ".join(f"{name} {value:.1f} s" for name, value in self.seconds.items() if name != "total")
+        out = [f"{self.name}: {self.num_frames} frames ({', '.join(f'{n} {s}' for s, n in self.counts.items())})"]
+        if self.resumed_from:
+            out.append(f"resumed at frame {self.resumed_from}")
+        out.append(f"{rate:.1f} frames a second, {self.peak_memory_mb:.0f} MB; {parts}")
+        return out + [f"warning: {text}" for text in self.warnings()]
+
+
+def stream_sequence(
+    sequence: Sequence,
+    run_dir: Path,
+    config: Config,
+    *,
+    resume: bool = False,
+    on_frame: OnFrame | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> StreamSummary:
+    """Solve a sequence frame by frame; results are written as frames leave the window.
+
+    Args:
+        sequence: Frames and cues, read one by one; its own tracks are used if it brings any.
+        run_dir: Folder of the run.
+        config: The whole configuration.
+        resume: Go on from the last checkpoint in ``run_dir`` if there is one.
+        on_frame: Told of every frame.
+        should_stop: Polled before every frame; True writes a checkpoint and ends with :class:`Cancelled`.
+
+    Raises:
+        InputError: If a cue cannot be read, or the checkpoint does not fit.
+        DegenerateProblemError: If there is no frame.
+        SolverError: If a window cannot be solved.
+        OutputError: If a result cannot be written.
+        Cancelled: If ``should_stop`` turned true.
+    """
+    check_sequence(sequence)
+    remove_leftovers(RunFolder(run_dir))
+    folder = StreamFolder(run_dir)
+    folder.remove_leftovers()
+    solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder)
+    resumed = folder.resume(solver, config) if resume else False
+    if not resumed:
+        RunFolder(run_dir).trajectory.unlink(missing_ok=True)
+        folder.checkpoint.unlink(missing_ok=True)
+    atomic_write_text(RunFolder(run_dir).config, dump_config(config))
+    first, began = solver.num_frames, time.perf_counter()
+    counts: dict[str, int] = {}
+    seconds: dict[str, float] = {}
+    for frame in range(first, sequence.num_frames):
+        if should_stop is not None and should_stop():
+            folder.save(solver, config)
+            raise Cancelled(f"stopped before frame {frame}; --resume goes on from there")
+        update = solver.add_frame(
+            sequence.images[frame], sequence.depths[frame], sequence.masks[frame], _tracks(sequence, frame),
+            float(sequence.timestamps[frame]),
+        )  # fmt: skip
+        counts[update.status.value] = counts.get(update.status.value, 0) + 1
+        for part, value in update.seconds.items():
+            seconds[part] = seconds.get(part, 0.0) + value
+        if on_frame is not None:
+            on_frame(update)
+        if (frame + 1) % config.incremental.checkpoint_interval == 0:
+            since = time.perf_counter()
+            folder.save(solver, config)
+            seconds["checkpoint"] = seconds.get("checkpoint", 0.0) + time.perf_counter() - since
+    folder.save(solver, config)
+    reconstruction = solver.finish()
+    write_result(RunFolder(run_dir), reconstruction)
+    seconds["total"] = time.perf_counter() - began
+    summary = StreamSummary(sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb())
+    atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
+    return summary
+
+
+def _tracks(sequence: Sequence, frame: int) -> FrameTracks | None:
+    tracks = sequence.tracks
+    if tracks is None:
+        return None
+    seen = np.flatnonzero(tracks.visible[:, frame])
+    return FrameTracks(seen.astype(np.int64), tracks.uv[seen, frame].astype(np.float64))

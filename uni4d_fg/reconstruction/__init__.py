@@ -1,1 +1,0 @@
-"""What comes out: the reconstruction, its files and its pictures."""

@@ -1,0 +1,30 @@
+"""The formats by name."""
+
+from __future__ import annotations
+
+from uni4d_fg.errors import InputError
+from uni4d_fg.optional import import_open3d, import_rerun
+from uni4d_fg.results.export.colmap import write_colmap
+from uni4d_fg.results.export.model import Exporter
+from uni4d_fg.results.export.nerfstudio import write_nerfstudio
+from uni4d_fg.results.export.ply import write_ply_folder
+from uni4d_fg.results.export.rrd import write_rrd
+from uni4d_fg.results.export.trajectories import write_kitti_folder, write_tum_folder
+from uni4d_fg.results.export.uni4d import write_uni4d_results
+
+FORMATS: dict[str, Exporter] = {
+    "colmap": Exporter(write_colmap, needs_images=True),
+    "nerfstudio": Exporter(write_nerfstudio, needs_images=True, require=import_open3d),
+    "tum": Exporter(write_tum_folder),
+    "kitti": Exporter(write_kitti_folder),
+    "ply": Exporter(write_ply_folder, require=import_open3d),
+    "rrd": Exporter(write_rrd, needs_images=True, require=import_rerun),
+    "uni4d": Exporter(write_uni4d_results, needs_images=True, require=import_open3d),
+}
+
+
+def exporter(name: str) -> Exporter:
+    """Return the exporter of a format. Raises InputError if there is none of that name."""
+    if name not in FORMATS:
+        raise InputError(f"unknown format '{name}'; choose among {', '.join(FORMATS)}")
+    return FORMATS[name]

@@ -1,0 +1,178 @@
+"""Coloured point clouds from images, fused depth and poses: one static, one dynamic per frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
+from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.errors import InputError
+from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.geometry.camera import camera_to_world, unproject
+from uni4d_fg.optional import import_open3d
+
+_POINTS_BETWEEN_MERGES = 2_000_000
+
+
+class Cloud(NamedTuple):
+    """A coloured point cloud."""
+
+    points: FloatArray
+    """(N, 3) world positions, metres."""
+    colors: ImageArray
+    """(N, 3) RGB."""
+
+
+def static_cloud(
+    images: FrameSource[ImageArray],
+    depths: FrameSource[Float32Array],
+    masks: FrameSource[Int32Array],
+    intrinsics: FloatArray,
+    world_T_cam: FloatArray,
+    config: FusionConfig,
+    *,
+    band_px: int = 5,
+) -> Cloud:
+    """Build the cloud of everything that does not move, over the whole video.
+
+    Pixels of moving instances, a band around them, and pixels at depth edges are left out. Points that share
+    a voxel are averaged; merging goes on while frames are read, so that memory does not grow with the video.
+
+    Args:
+        images: T images (H, W, 3), RGB.
+        depths: T maps (H, W), metres, NaN where missing.
+        masks: T label maps (H, W), 0 static.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        world_T_cam: (T, 4, 4) camera to world, metres.
+        config: Strides, voxel size and edge threshold.
+        band_px: Width of the band around instances, px.
+
+    Raises:
+        InputError: If the maps of a frame differ in size.
+        MissingDependencyError: If voxels are asked for and Open3D cannot be loaded.
+    """
+    parts: list[Cloud] = []
+    waiting = 0
+    for frame in range(0, len(images), config.static_frame_stride):
+        image, depth, mask = _maps(frame, images, depths, masks)
+        keep = ~dilate(mask > 0, band_px) & ~depth_edges(depth, config.edge_relative_gradient)
+        part = lift(image, depth, keep, intrinsics, world_T_cam[frame], config.static_stride)
+        parts.append(part)
+        waiting += len(part.points)
+        if waiting > _POINTS_BETWEEN_MERGES and config.static_voxel_m > 0.0:
+            parts, waiting = [merge_voxels(_concatenate(parts), config.static_voxel_m)], 0
+    return merge_voxels(_concatenate(parts), config.static_voxel_m)
+
+
+def dynamic_clouds(
+    images: FrameSource[ImageArray],
+    depths: FrameSource[Float32Array],
+    masks: FrameSource[Int32Array],
+    intrinsics: FloatArray,
+    world_T_cam: FloatArray,
+    config: FusionConfig,
+) -> Iterator[Cloud]:
+    """Yield the cloud of the moving instances of each frame in turn; arguments as in :func:`static_cloud`."""
+    for frame in range(len(images)):
+        image, depth, mask = _maps(frame, images, depths, masks)
+        yield dynamic_cloud(image, depth, mask, intrinsics, world_T_cam[frame], config)
+
+
+def dynamic_cloud(
+    image: ImageArray,
+    depth: Float32Array,
+    mask: Int32Array,
+    intrinsics: FloatArray,
+    world_T_cam: FloatArray,
+    config: FusionConfig,
+) -> Cloud:
+    """Return the cloud of the moving instances of one frame; depth edges are left out."""
+    keep = (mask > 0) & ~depth_edges(depth, config.edge_relative_gradient)
+    return lift(image, depth, keep, intrinsics, world_T_cam, config.dynamic_stride)
+
+
+def lift(
+    image: ImageArray,
+    depth: Float32Array,
+    keep: BoolArray,
+    intrinsics: FloatArray,
+    world_T_cam: FloatArray,
+    stride: int,
+) -> Cloud:
+    """Lift every ``stride``-th pixel (in x and y) that is kept and has depth into the world."""
+    chosen = np.zeros(depth.shape, dtype=bool)
+    chosen[::stride, ::stride] = True
+    with np.errstate(invalid="ignore"):
+        chosen &= keep & np.isfinite(depth) & (depth > 0.0)
+    v, u = np.nonzero(chosen)
+    uv = np.stack((u, v), axis=-1).astype(np.float64)
+    points = camera_to_world(world_T_cam, unproject(intrinsics, uv, depth[v, u].astype(np.float64)))
+    return Cloud(points, image[v, u])
+
+
+def depth_edges(depth: Float32Array, relative_gradient: float) -> BoolArray:
+    """Return the pixels (H, W) whose depth differs from a neighbour's by more than this part of the smaller one.
+
+    Both pixels of a pair are marked: depth that mixes two surfaces may lie on either side of the edge.
+    """
+    edges = np.zeros(depth.shape, dtype=bool)
+    with np.errstate(invalid="ignore"):
+        for first, second in (
+            ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+            ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+        ):
+            a, b = depth[first], depth[second]
+            jump = np.abs(a - b) > relative_gradient * np.minimum(a, b)
+            edges[first] |= jump
+            edges[second] |= jump
+    return edges
+
+
+def dilate(mask: BoolArray, radius_px: int) -> BoolArray:
+    """Return the pixels within ``radius_px`` of a set pixel."""
+    if radius_px <= 0:
+        return mask
+    side = 2 * radius_px + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
+
+
+def merge_voxels(cloud: Cloud, voxel_m: float) -> Cloud:
+    """Average positions and colours within cubes of side ``voxel_m``; 0 keeps every point.
+
+    Raises:
+        MissingDependencyError: If Open3D cannot be loaded.
+    """
+    if voxel_m <= 0.0 or len(cloud.points) == 0:
+        return cloud
+    open3d = import_open3d()
+    fine = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.points))
+    fine.colors = open3d.utility.Vector3dVector(cloud.colors.astype(np.float64))
+    coarse = fine.voxel_down_sample(voxel_m)
+    colors = np.clip(np.rint(np.asarray(coarse.colors)), 0, 255).astype(np.uint8)
+    return Cloud(np.array(coarse.points), colors)
+
+
+def _concatenate(parts: list[Cloud]) -> Cloud:
+    if not parts:
+        return Cloud(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+    return Cloud(np.concatenate([p.points for p in parts]), np.concatenate([p.colors for p in parts]))
+
+
+def _maps(
+    frame: int,
+    images: FrameSource[ImageArray],
+    depths: FrameSource[Float32Array],
+    masks: FrameSource[Int32Array],
+) -> tuple[ImageArray, Float32Array, Int32Array]:
+    image, depth, mask = images[frame], depths[frame], masks[frame]
+    if not image.shape[:2] == depth.shape == mask.shape:
+        raise InputError(
+            f"clouds: frame {frame}: image {image.shape[:2]}, depth {depth.shape} and mask {mask.shape} "
+            "must have one size"
+        )
+    return image, depth, mask

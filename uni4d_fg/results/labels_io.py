@@ -1,0 +1,63 @@
+"""Reading and writing of ``labels.npz``: the tracks a run used and what each was taken to be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from uni4d_fg.errors import InputError
+from uni4d_fg.files import load_npz, save_npz
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel, Tracks
+
+_RANKS = {"uv": 3, "visible": 2, "query_frame": 1, "label": 1, "instance": 1, "weight": 2, "depth": 2}
+
+
+def save_labels(path: Path, labelled: LabelledTracks) -> None:
+    """Write labelled tracks to an ``.npz``, whole or not at all.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    tracks = labelled.tracks
+    confidence = {} if tracks.confidence is None else {"confidence": tracks.confidence}
+    save_npz(
+        path,
+        uv=tracks.uv,
+        visible=tracks.visible,
+        query_frame=tracks.query_frame,
+        label=labelled.label,
+        instance=labelled.instance,
+        weight=labelled.weight,
+        depth=labelled.depth,
+        **confidence,
+    )
+
+
+def load_labels(path: Path) -> LabelledTracks:
+    """Read labelled tracks.
+
+    Raises:
+        InputError: If the file is missing or damaged, shapes disagree, or a label is unknown.
+    """
+    arrays = load_npz(path, _RANKS, {"confidence": 2})
+    confidence = arrays.get("confidence")
+    tracks = Tracks(
+        arrays["uv"].astype(np.float32),
+        arrays["visible"],
+        arrays["query_frame"].astype(np.int32),
+        None if confidence is None else confidence.astype(np.float32),
+    )
+    shape = tracks.visible.shape
+    for name, expected in (("label", shape[:1]), ("instance", shape[:1]), ("weight", shape), ("depth", shape)):
+        if arrays[name].shape != expected:
+            raise InputError(f"{path}: {name} has shape {arrays[name].shape}, expected {expected}")
+    if not np.isin(arrays["label"], [label.value for label in TrackLabel]).all():
+        raise InputError(f"{path}: a label is none of {', '.join(f'{n.value} ({n.name})' for n in TrackLabel)}")
+    return LabelledTracks(
+        tracks,
+        arrays["label"].astype(np.int32),
+        arrays["instance"].astype(np.int32),
+        arrays["weight"].astype(np.float32),
+        arrays["depth"].astype(np.float32),
+    )

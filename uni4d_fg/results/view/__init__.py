@@ -1,0 +1,1 @@
+"""An interactive view of a finished run in a browser."""

@@ -1,0 +1,131 @@
+"""The pose of a new frame: constant velocity, then its tracks against points that are known, robustly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import LOG_SCALE, POSE
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.optim.cluster_robust import clustered_marginals
+from uni4d_fg.optim.marginals import camera_marginals
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import Stage, StageRunner
+from uni4d_fg.slam.incremental.labels import LabelledFrame
+from uni4d_fg.slam.stages.bundle_adjustment import depth_prior_terms, reprojection_term
+from uni4d_fg.slam.stages.energy import MAP
+from uni4d_fg.slam.stages.lifting import frame_log_scales
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
+from uni4d_fg.slam.stages.static_covariance import track_cells
+from uni4d_fg.slam.stages.static_outliers import reprojection_residual
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """A new frame's pose relative to the known points."""
+
+    world_T_cam: FloatArray
+    log_scale: float
+    inlier: BoolArray
+    """(n,) which of the observations agree with it."""
+    covariance: FloatArray
+    """(6, 6) given the points, with clusters of tracks that may err alike; NaN if not determined."""
+
+
+def predict(poses: FloatArray, frames: FloatArray, frame: float) -> FloatArray:
+    """Continue the last relative motion (constant velocity per frame).
+
+    Args:
+        poses: (n, 4, 4), the last one or two are used.
+        frames: (n,) their frame numbers.
+        frame: The number of the new one.
+    """
+    if len(poses) < 2:
+        return np.asarray(poses[-1])
+    step = se3.inverse(poses[-2]) @ poses[-1]
+    gap = float(frames[-1] - frames[-2])
+    omega = se3.so3_log(step[None, :3, :3])[0]
+    factor = float(frame - frames[-1]) / gap
+    moved = np.eye(4)
+    moved[:3, :3] = se3.so3_exp(factor * omega)
+    moved[:3, 3] = factor * step[:3, 3]
+    result: FloatArray = se3.orthonormalize(poses[-1] @ moved)
+    return result
+
+
+def locate(
+    guesses: list[FloatArray],
+    tracks: LabelledFrame,
+    points: FloatArray,
+    intrinsics: FloatArray,
+    noise: StaticNoise,
+    config: Config,
+    run: StageRunner,
+) -> FramePose:
+    """Solve a frame's pose and log-scale with the points held, from each guess; the most inliers win.
+
+    Args:
+        guesses: (4, 4) starting poses; later ones are tried only if fewer than half agree.
+        tracks: n observations.
+        points: (n, 3) their world points.
+        intrinsics: (4,).
+        noise: Sigmas.
+        config: Stage 2's kernels and outlier rule, and the pose solver.
+        run: What solves the declared stage.
+    """
+    zero = np.zeros(len(points), dtype=np.int64)
+    observations = Observations(np.arange(len(points)), zero, tracks.uv, tracks.depth, tracks.weight)
+    ba = config.bundle_adjustment
+    sigma = noise.effective_depth_sigma(2.0) * ba.depth_sigma_factor
+    batches = [
+        reprojection_term(observations, observations.track, noise.reprojection_sigma_px, 1, ba, MAP),
+        *depth_prior_terms(observations, observations.track, sigma, 1, ba),
+    ]
+    free = {POSE: np.ones((1, 6), dtype=bool), LOG_SCALE: np.ones((1, 1), dtype=bool)}
+    stage = Stage("pose", Problem(tuple(batches), free), config.incremental.pose_solver)
+    best: tuple[State, BoolArray] | None = None
+    for guess in guesses:
+        scale = frame_log_scales(observations, guess[None], points, 1)
+        state, _ = run(stage, Cameras(guess[None], intrinsics, scale).state(points), None)
+        error = np.linalg.norm(reprojection_residual(state, observations, observations.track), axis=1)
+        z = world_to_camera(np.broadcast_to(state[POSE][0], (len(points), 4, 4)), points)[:, 2]
+        inlier: BoolArray = (error <= ba.max_reprojection_px) & (z > NEAR_PLANE)
+        if best is None or inlier.sum() > best[1].sum():
+            best = (state, inlier)
+        if inlier.sum() > 0.5 * len(points):
+            break
+    assert best is not None
+    state, inlier = best
+    marginals = camera_marginals(stage.problem, state, stage.solver, None)
+    if marginals is None:
+        return FramePose(state[POSE][0], float(state[LOG_SCALE][0, 0]), inlier, np.full((6, 6), np.nan))
+    covariance = marginals.blocks(POSE, 1)[0]
+    clusters = track_cells(observations, intrinsics, ba)
+    shared = None if clusters is None else clustered_marginals(stage.problem, state, stage.solver, clusters)
+    if shared is not None:
+        # The points are uncertain too, and cells are few: neither figure is trusted where it is the smaller one.
+        covariance = larger_covariance(covariance, shared.blocks(POSE, 1)[0])
+    return FramePose(state[POSE][0], float(state[LOG_SCALE][0, 0]), inlier, covariance)
+
+
+def larger_covariance(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the smallest covariance (n, n) that, on the axes the two share, is at least as large as either."""
+    root = np.linalg.cholesky(first)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, second).T)
+    values, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    factor = root @ (axes * np.sqrt(np.maximum(values, 1.0)))
+    result: FloatArray = factor @ factor.T
+    return result
+
+
+def composed_covariance(reference: FloatArray, reference_T_cam: FloatArray, relative: FloatArray) -> FloatArray:
+    """Return the covariance of ``world_T_reference reference_T_cam`` from those of its two parts, (6, 6) each."""
+    back = se3.adjoint(se3.inverse(reference_T_cam))
+    result: FloatArray = back @ reference @ back.T + relative
+    return result

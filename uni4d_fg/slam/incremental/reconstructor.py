@@ -1,0 +1,367 @@
+"""Frames in, one at a time; poses, landmarks and moving points out. Memory and time per frame are bounded."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.errors import ConfigError, InputError
+from uni4d_fg.geometry import se3
+from uni4d_fg.optim.backend import choose_backend
+from uni4d_fg.optim.stage import LevenbergMarquardtRunner
+from uni4d_fg.slam.incremental.dynamic import DynamicWindow, in_world, moving_scales
+from uni4d_fg.slam.incremental.labels import LabelledFrame, TrackBook
+from uni4d_fg.slam.incremental.memory import return_free_memory
+from uni4d_fg.slam.incremental.model import (
+    DynamicPoints,
+    FinishedFrame,
+    FrameStatus,
+    FrameTracks,
+    FrameUpdate,
+    Landmarks,
+)
+from uni4d_fg.slam.incremental.pose import FramePose, composed_covariance, locate, predict
+from uni4d_fg.slam.incremental.results import Results, ResultsInMemory, assemble_results
+from uni4d_fg.slam.incremental.tracking import OnlineTracker
+from uni4d_fg.slam.incremental.window import CameraWindow, LeftLandmarks
+from uni4d_fg.slam.reconstruction import Reconstruction
+from uni4d_fg.slam.stages.scene import StaticNoise
+
+
+@dataclass
+class PendingFrame:
+    """A frame whose keyframe is still in the window."""
+
+    frame: int
+    timestamp: float
+    status: FrameStatus
+    keyframe: int
+    """Number of the keyframe that its pose is relative to; its own for a keyframe."""
+    keyframe_T_cam: FloatArray
+    """(4, 4)."""
+    covariance: FloatArray
+    """(6, 6) relative to the keyframe; zero for a keyframe."""
+    log_scale: float
+    dynamic: DynamicPoints
+    """In the axes of its camera."""
+
+
+class IncrementalReconstructor:
+    """Solves a video frame by frame over a sliding window.
+
+    Args:
+        intrinsics: (4,) fx, fy, cx, cy, px: known, or a starting value when ``input.intrinsics`` is free.
+        image_size: (height, width), px.
+        config: The whole configuration; ``incremental`` has the window, the rest is that of the batch stages.
+        results: Takes what leaves the window; kept in memory when None.
+
+    Raises:
+        ConfigError: If the configuration asks for what cannot be done in a window.
+        InputError: If the intrinsics are not usable.
+    """
+
+    def __init__(
+        self, intrinsics: FloatArray, image_size: tuple[int, int], config: Config, results: Results | None = None
+    ):
+        if config.energy != "map" or config.solver != "lm":
+            raise ConfigError("incremental solving is made for energy 'map' and solver 'lm'; the paper's norms have no "
+                              "information to marginalize: choose the preset 'default' or 'fast'")  # fmt: skip
+        incremental = config.incremental
+        if not incremental.nonrigid_lag + 2 <= min(incremental.nonrigid_window, incremental.window + 1):
+            raise ConfigError(
+                f"incremental.nonrigid_lag {incremental.nonrigid_lag} must be at least 2 less than nonrigid_window "
+                f"{incremental.nonrigid_window} and less than window {incremental.window}"
+            )
+        intrinsics = np.array(intrinsics, dtype=np.float64)
+        if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
+            raise InputError(f"intrinsics must be fx, fy, cx, cy in px with positive focal lengths, got {intrinsics}")
+        self.config, self.image_size = config, image_size
+        ba = config.bundle_adjustment
+        noise = StaticNoise(ba.reprojection_sigma_px, ba.depth_sigma, ba.depth_correlation)
+        self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise)
+        self.dynamic = DynamicWindow(config, depth_sigma=ba.depth_sigma)
+        self.book = TrackBook()
+        self.tracker = OnlineTracker(config.tracking, incremental.max_live_tracks)
+        self.pending: list[PendingFrame] = []
+        self.results: Results = ResultsInMemory() if results is None else results
+        self.num_frames = 0
+        self.last_timestamp = -np.inf
+        self.last_pose = np.eye(4)
+        self._run = LevenbergMarquardtRunner(choose_backend(config.backend))
+        self._seconds: dict[str, float] = {}
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(4,) present estimate."""
+        return self.window.intrinsics
+
+    def add_frame(
+        self,
+        image: ImageArray,
+        depth: Float32Array,
+        mask: Int32Array | None = None,
+        tracks: FrameTracks | None = None,
+        timestamp: float | None = None,
+    ) -> FrameUpdate:
+        """Take the next frame.
+
+        Args:
+            image: (H, W, 3) uint8 RGB, or (H, W) grey.
+            depth: (H, W) metres, NaN, 0 or negative where missing.
+            mask: (H, W) 0 static, > 0 instance that may move; all static when None.
+            tracks: Points tracked to this frame; None tracks online.
+            timestamp: Seconds, increasing; the number of the frame when None. A frame at the time of the last one,
+                or before it, changes nothing and is reported as such.
+
+        Raises:
+            InputError: If an array has a wrong shape or the timestamp is not finite.
+            SolverError: If the window cannot be solved.
+        """
+        time_now = float(self.num_frames if timestamp is None else timestamp)
+        depth, mask = self._checked(image, depth, mask, time_now)
+        self._seconds = {}
+        if time_now <= self.last_timestamp:
+            status = FrameStatus.REPEATED if time_now == self.last_timestamp else FrameStatus.OUT_OF_ORDER
+            return self._update(status, DynamicPoints.none(), 0, (), ())
+        frame = self.num_frames
+        with self._timed("track"):
+            tracks = self.tracker.advance(image) if tracks is None else tracks
+            found = self.book.observe(
+                frame, tracks, image, depth, mask, self.config.labels, self.config.input,
+                self.config.bundle_adjustment.drift_frames,
+            )  # fmt: skip
+        self.window.remove_tracks(found.rejected)
+        self.dynamic.remove_tracks(found.rejected)
+        static, moving = found.select(static=True), found.select(static=False)
+        with self._timed("pose"):
+            pose, used = self._pose(frame, static)
+        status = self._status(frame, static, pose)
+        self._append(frame, time_now, status, static, pose)
+        self.num_frames, self.last_timestamp = frame + 1, time_now
+        landmarks: list[Landmarks] = []
+        left: list[tuple[int, FloatArray, FloatArray, float]] = []
+        if status is not FrameStatus.TRACKED:
+            with self._timed("window"):
+                self.window.solve(self._run)
+            with self._timed("covariance"):
+                self.window.update_covariance()
+            while len(self.window) > self.config.incremental.window:
+                with self._timed("marginalize"):
+                    oldest, gone = self.window.slide()
+                left.append((oldest.frame, oldest.world_T_cam, oldest.covariance, oldest.log_scale))
+                landmarks.append(self._coloured(gone))
+        self.last_pose = self._pose_of(self.pending[-1])
+        with self._timed("nonrigid"):
+            dynamic = self._solve_dynamic(frame, static, moving)
+        finished = tuple(f for keyframe in left for f in self._finish_keyframe(*keyframe))
+        self._forget(frame)
+        self.results.add(finished, tuple(landmarks))
+        return_free_memory()
+        return self._update(status, dynamic, used, finished, tuple(landmarks))
+
+    def finish(self) -> Reconstruction:
+        """Hand over what is left in the window and collect the result; more frames may not be added.
+
+        Raises:
+            DegenerateProblemError: If no frame was added.
+        """
+        self.flush()
+        return assemble_results(
+            self.results, self.window.intrinsics, self.window.intrinsics_covariance, self.image_size
+        )
+
+    def flush(self) -> None:
+        """Hand over what is left in the window to ``results``."""
+        window = self.window
+        frames = [
+            finished
+            for row, keyframe in enumerate(window.frame.tolist())
+            for finished in self._finish_keyframe(
+                keyframe, window.pose[row], window.covariance[row], float(window.log_scale[row])
+            )
+        ]
+        landmarks: tuple[Landmarks, ...] = ()
+        if len(window.landmark_track):
+            landmarks = (self._coloured(window.all_landmarks()),)
+        self.results.add(tuple(frames), landmarks)
+        self.pending = []
+        self.window = CameraWindow(
+            self.config, window.prior_intrinsics, window.intrinsics, window.noise,
+            intrinsics_covariance=window.intrinsics_covariance,
+        )  # fmt: skip
+
+    def _checked(
+        self, image: ImageArray, depth: Float32Array, mask: Int32Array | None, timestamp: float
+    ) -> tuple[Float32Array, Int32Array]:
+        where = f"frame {self.num_frames}"
+        mask = np.zeros(self.image_size, dtype=np.int32) if mask is None else mask
+        for name, array in (("image", image), ("depth", depth), ("mask", mask)):
+            if array.shape[:2] != self.image_size or array.ndim > (3 if name == "image" else 2):
+                raise InputError(f"{where}: {name} has shape {array.shape}, the video is {self.image_size}")
+        if image.dtype != np.uint8:
+            raise InputError(f"{where}: the image has dtype {image.dtype}, expected uint8")
+        if not np.isfinite(timestamp):
+            raise InputError(f"{where}: the timestamp {timestamp} is not finite")
+        cue = np.asarray(depth, dtype=np.float32)
+        return np.where(cue > 0, cue, np.float32(np.nan)), np.asarray(mask, dtype=np.int32)
+
+    def _pose(self, frame: int, static: LabelledFrame) -> tuple[FramePose | None, int]:
+        """Return the pose of a new frame against known points, None if too few agree, and how many agree."""
+        window = self.window
+        if len(window) == 0:
+            return FramePose(np.eye(4), 0.0, np.ones(len(static.track), dtype=bool), np.zeros((6, 6))), len(
+                static.track
+            )
+        known, points = window.landmarks_of(static.track)
+        if known.sum() < 2 * self.config.incremental.min_tracks:
+            points[~known] = window.lifted(static.track[~known])
+        usable = np.isfinite(points).all(axis=1)
+        if usable.sum() < self.config.incremental.min_tracks:
+            return None, int(usable.sum())
+        chosen = LabelledFrame(
+            static.track[usable], static.uv[usable], static.depth[usable], static.weight[usable],
+            static.label[usable], static.rejected,
+        )  # fmt: skip
+        guesses = [self._predicted(frame), self.last_pose]
+        found = locate(guesses, chosen, points[usable], window.intrinsics, window.noise, self.config, self._run)
+        count = int(found.inlier.sum())
+        if count < self.config.incremental.min_tracks:
+            return None, count
+        inlier: BoolArray = np.ones(len(static.track), dtype=bool)
+        inlier[np.flatnonzero(usable)[~found.inlier]] = False
+        return replace(found, inlier=inlier), count
+
+    def _predicted(self, frame: int) -> FloatArray:
+        last = self.pending[-2:]
+        poses = np.stack([self._pose_of(p) for p in last])
+        return predict(poses, np.array([p.frame for p in last], dtype=np.float64), float(frame))
+
+    def _pose_of(self, pending: PendingFrame) -> FloatArray:
+        row = int(np.searchsorted(self.window.frame, pending.keyframe))
+        if row >= len(self.window) or self.window.frame[row] != pending.keyframe:
+            return self.last_pose
+        result: FloatArray = self.window.pose[row] @ pending.keyframe_T_cam
+        return result
+
+    def _status(self, frame: int, static: LabelledFrame, pose: FramePose | None) -> FrameStatus:
+        """Decide whether a frame joins the window."""
+        config, window = self.config.incremental, self.window
+        if pose is None:
+            return FrameStatus.BRIDGED
+        if len(window) == 0 or frame - window.frame[-1] >= config.keyframe_interval or window.bridged[-1] > 0:
+            return FrameStatus.KEYFRAME
+        newest = window.observations.select(window.observations.frame == len(window) - 1)
+        _, here, there = np.intersect1d(static.track, newest.track, assume_unique=True, return_indices=True)
+        if len(here) < config.keyframe_overlap * max(len(newest), config.min_tracks):
+            return FrameStatus.KEYFRAME
+        moved = np.linalg.norm(static.uv[here] - newest.uv[there], axis=1)
+        return (
+            FrameStatus.KEYFRAME
+            if np.median(moved) >= config.keyframe_parallax * max(self.image_size)
+            else FrameStatus.TRACKED
+        )
+
+    def _append(
+        self, frame: int, timestamp: float, status: FrameStatus, static: LabelledFrame, pose: FramePose | None
+    ) -> None:
+        if status is FrameStatus.TRACKED:
+            assert pose is not None
+            keyframe = int(self.window.frame[-1])
+            relative = se3.inverse(self.window.pose[-1]) @ pose.world_T_cam
+            covariance, log_scale = pose.covariance, pose.log_scale
+        else:
+            keyframe, relative, covariance = frame, np.eye(4), np.zeros((6, 6))
+            log_scale = 0.0 if pose is None else pose.log_scale
+            world_T_cam = self._predicted(frame) if pose is None else pose.world_T_cam
+            agreeing = static if pose is None else _picked(static, pose.inlier)
+            bridged = 0 if pose is not None else self._bridged_frames() + 1
+            self.window.append(frame, world_T_cam, log_scale, agreeing, bridged)
+        none = DynamicPoints.none()
+        self.pending.append(PendingFrame(frame, timestamp, status, keyframe, relative, covariance, log_scale, none))
+
+    def _bridged_frames(self) -> int:
+        """Return how many of the newest frames were bridged."""
+        last = bool(self.pending) and self.pending[-1].status is FrameStatus.BRIDGED
+        return int(self.window.bridged[-1]) if last else 0
+
+    def _solve_dynamic(self, frame: int, static: LabelledFrame, moving: LabelledFrame) -> DynamicPoints:
+        """Add the moving observations of the newest frame and solve their window; return its points in the world."""
+        newest = self.pending[-1]
+        log_scale = newest.log_scale if newest.status is FrameStatus.TRACKED else float(self.window.log_scale[-1])
+        neighbours = self.config.nonrigid.local_scale_neighbours
+        samples = self.config.nonrigid.local_scale_samples
+        _, points = self.window.landmarks_of(static.track)
+        scales, sigma = moving_scales(static, points, moving, self.last_pose, log_scale, neighbours, samples)
+        if np.isfinite(sigma):
+            floor, part = self.config.bundle_adjustment.min_depth_sigma, self.config.incremental.noise_smoothing
+            self.dynamic.depth_sigma += part * (max(sigma, floor) - self.dynamic.depth_sigma)
+        self.dynamic.append(frame, self.last_pose, moving, scales)
+        by_frame = {pending.frame: pending for pending in self.pending}
+        for i, number in enumerate(self.dynamic.frame.tolist()):
+            if number in by_frame:
+                self.dynamic.pose[i] = self._pose_of(by_frame[number])
+        solved = self.dynamic.solve(self.window.intrinsics, self.window.noise, self.book, self._run)
+        lag = self.config.incremental.nonrigid_lag
+        for number, points_of_frame in solved.items():
+            if number >= frame - lag and number in by_frame:
+                by_frame[number].dynamic = points_of_frame
+        return in_world(solved[frame], self.last_pose)
+
+    def _finish_keyframe(
+        self, keyframe: int, world_T_key: FloatArray, covariance: FloatArray, log_scale: float
+    ) -> Iterator[FinishedFrame]:
+        """Yield the frames that hang on a keyframe and forget them."""
+        mine = [pending for pending in self.pending if pending.keyframe == keyframe]
+        self.pending = [pending for pending in self.pending if pending.keyframe != keyframe]
+        for pending in mine:
+            pose = se3.orthonormalize(world_T_key @ pending.keyframe_T_cam)
+            own = pending.frame == keyframe
+            yield FinishedFrame(
+                pending.frame,
+                pending.timestamp,
+                pending.status,
+                pose,
+                covariance if own else composed_covariance(covariance, pending.keyframe_T_cam, pending.covariance),
+                log_scale if own else pending.log_scale,
+                in_world(pending.dynamic, pose),
+            )
+
+    def _coloured(self, left: LeftLandmarks) -> Landmarks:
+        return Landmarks(left.track, left.point, left.error, left.count, self.book.colors(left.track))
+
+    def _forget(self, frame: int) -> None:
+        used: list[IntArray] = [self.window.observations.track, self.dynamic.observations.track]
+        self.book.forget(frame - self.config.incremental.window, np.unique(np.concatenate(used)))
+
+    def _update(
+        self, status: FrameStatus, dynamic: DynamicPoints, used: int, finished: tuple[FinishedFrame, ...],
+        landmarks: tuple[Landmarks, ...],
+    ) -> FrameUpdate:  # fmt: skip
+        window, covariance = self.window, np.full((6, 6), np.nan)
+        if self.pending:
+            newest = self.pending[-1]
+            covariance = window.covariance[-1]
+            if newest.status is FrameStatus.TRACKED:
+                covariance = composed_covariance(covariance, newest.keyframe_T_cam, newest.covariance)
+        return FrameUpdate(
+            status, max(self.num_frames - 1, 0), self.last_pose, covariance, window.landmark_track, window.landmark,
+            dynamic, finished, landmarks, window.error_px, used, len(window), dict(self._seconds),
+        )  # fmt: skip
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - began
+
+
+def _picked(frame: LabelledFrame, keep: np.ndarray) -> LabelledFrame:
+    return LabelledFrame(
+        frame.track[keep], frame.uv[keep], frame.depth[keep], frame.weight[keep], frame.label[keep], frame.rejected
+    )

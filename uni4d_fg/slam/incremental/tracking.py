@@ -1,0 +1,62 @@
+"""Lucas-Kanade tracking of a stream: one image at a time, a bounded number of points.
+
+Points start on the grid of the batch tracker (:mod:`uni4d_fg.frontend.tracks.lucas_kanade`) every ``query_interval``
+frames, but only where no live point is near: a camera at rest would otherwise collect grids without end. Lost
+points are not looked for again. There is no backward sweep, because earlier images are gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from uni4d_fg.arrays import Float32Array, ImageArray, IntArray, evenly_spread
+from uni4d_fg.config.cues import TrackingConfig
+from uni4d_fg.frontend.tracks.lucas_kanade import query_grid
+from uni4d_fg.frontend.tracks.optical_flow import move_points
+from uni4d_fg.slam.incremental.model import FrameTracks
+
+
+@dataclass
+class OnlineTracker:
+    """Follows points from image to image."""
+
+    config: TrackingConfig
+    max_tracks: int
+    previous: ImageArray | None = None
+    """(H, W) the last image, grey."""
+    track: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
+    next_track: int = 0
+    since_query: int = 0
+
+    def advance(self, image: ImageArray) -> FrameTracks:
+        """Follow the points to the next image (H, W, 3) or (H, W) uint8 and start new ones where there are none."""
+        grey: ImageArray = np.ascontiguousarray(
+            image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8
+        )
+        if self.previous is not None:
+            kept, self.points = move_points(self.previous, grey, self.points, self.config)
+            self.track = self.track[kept]
+        if self.previous is None or self.since_query >= self.config.query_interval:
+            self._start((grey.shape[0], grey.shape[1]))
+            self.since_query = 0
+        self.since_query += 1
+        self.previous = grey
+        return FrameTracks(self.track.copy(), self.points.astype(np.float64))
+
+    def _start(self, image_size: tuple[int, int]) -> None:
+        grid = query_grid(image_size, self.config)
+        if len(self.points):
+            spacing = 0.5 * max(image_size[1] / self.config.grid_columns, image_size[0] / self.config.grid_rows)
+            distance, _ = cKDTree(self.points).query(grid)
+            grid = grid[distance > spacing]
+        room = max(self.max_tracks - len(self.points), 0)
+        if len(grid) > room:
+            grid = grid[evenly_spread(len(grid), room)]
+        self.track = np.concatenate([self.track, self.next_track + np.arange(len(grid), dtype=np.int64)])
+        self.points = np.concatenate([self.points, grid])
+        self.next_track += len(grid)

@@ -1,0 +1,302 @@
+"""Stage 2: bundle adjustment of poses, intrinsics, depth scales and landmarks.
+
+Landmarks start at the mean lift of their depth cues. With the MAP energy a first solve uses the configured
+sigmas; observations that disagree are dropped, the noise of reprojection and of depth is measured on what
+stays, and a second solve uses it. Frame 0's pose is the gauge; the depth prior (or, without it, the distance
+of the two farthest cameras) holds the scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
+from uni4d_fg.errors import DegenerateProblemError
+from uni4d_fg.factors.batch import FactorBatch
+from uni4d_fg.factors.depth_prior import static_depth_prior
+from uni4d_fg.factors.priors import log_scale_prior, scale_anchor
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.static_reprojection import static_reprojection
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.optim.added_factors import HOLDS_SCALE
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
+from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
+from uni4d_fg.slam.stages.lifting import lift, mean_per_row
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
+from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
+from uni4d_fg.slam.stages.static_outliers import drop_outliers, landmark_errors, measure_noise, spatial_inliers
+from uni4d_fg.slam.stages.terms import camera_motion_terms, intrinsics_priors
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """What stage 2 may move besides landmarks."""
+
+    poses: bool
+    intrinsics: bool
+
+
+def without_camera_motion(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:
+    """Return stage 2 without E_cam, which is made for consecutive frames."""
+    still = CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0)
+    return config.model_copy(update={"camera_motion": still})
+
+
+def bundle_adjustment_problem(
+    state: State,
+    observations: Observations,
+    noise: StaticNoise,
+    config: BundleAdjustmentConfig,
+    prior_intrinsics: FloatArray,
+    freedom: Freedom,
+    energy: Energy = MAP,
+    camera_motion: Sequence[FactorBatch] | None = None,
+) -> Problem:
+    """Put bundle adjustment together.
+
+    Args:
+        state: Poses (T), intrinsics, log-scales and landmarks (named by track).
+        observations: Observations of exactly those landmarks.
+        noise: Sigmas of the MAP energy.
+        config: Stage 2.
+        prior_intrinsics: (1, 4) center of the intrinsics' prior.
+        freedom: What is free besides landmarks and log-scales.
+        energy: Weighs the terms.
+        camera_motion: E_cam, where frames do not follow each other; over all frames when None.
+    """
+    num_frames = len(state[POSE])
+    _, row = observations.rows()
+    problem = Problem.over(state).eliminate(LANDMARK)
+    problem.add(reprojection_term(observations, row, noise.reprojection_sigma_px, num_frames, config, energy))
+    if camera_motion is None:
+        camera_motion = camera_motion_terms(np.arange(num_frames), config.camera_motion, energy)
+    problem.add(camera_motion)
+    problem.fix(POSE, rows=[0] if freedom.poses else None)
+    if not freedom.intrinsics:
+        problem.fix(INTRINSICS)
+    else:
+        if not config.free_principal_point:
+            problem.fix(INTRINSICS, entries=[2, 3])
+        if energy.is_likelihood:
+            problem.add(intrinsics_priors(prior_intrinsics, config.focal_prior_fraction, config.aspect_prior_sigma))
+    if config.depth_prior:
+        per_track = len(observations) / max(len(state[LANDMARK]), 1)
+        sigma = noise.effective_depth_sigma(per_track) * config.depth_sigma_factor
+        problem.add(depth_prior_terms(observations, row, sigma, num_frames, config))
+    else:
+        problem.fix(LOG_SCALE)
+        if freedom.poses:
+            problem.add(scale_anchors(state[POSE], config.scale_anchor_sigma))
+    return problem
+
+
+def structure_problem(
+    state: State, observations: Observations, noise: StaticNoise, config: BundleAdjustmentConfig
+) -> Problem:
+    """Put the refinement of landmarks and frame scales with frozen cameras together.
+
+    Bundle adjustment widens the depth prior (``depth_sigma_factor``) because the errors of a depth cue are
+    correlated and would bias the cameras. With the cameras known, the structure is best where triangulation
+    and all depth cues of a track agree, each at its own noise.
+    """
+    num_frames = len(state[POSE])
+    _, row = observations.rows()
+    problem = Problem.over(state).eliminate(LANDMARK).fix(POSE).fix(INTRINSICS)
+    problem.add(reprojection_term(observations, row, noise.reprojection_sigma_px, num_frames, config, MAP))
+    sigma = min(noise.depth_sigma, config.depth_sigma)
+    return problem.add(depth_prior_terms(observations, row, sigma, num_frames, config))
+
+
+def reprojection_term(
+    observations: Observations,
+    row: IntArray,
+    sigma: float,
+    num_frames: int,
+    config: BundleAdjustmentConfig,
+    energy: Energy,
+) -> FactorBatch:
+    """Return E_BA; ``row`` (N,) is the landmark row of each observation."""
+    noise = energy.observed(sigma, observations.weight, config.reprojection_kernel, observations.frame, num_frames)
+    return static_reprojection(observations.frame, row, 0, uv=observations.uv, **noise)
+
+
+def depth_prior_terms(
+    observations: Observations, row: IntArray, sigma: float, num_frames: int, config: BundleAdjustmentConfig
+) -> list[FactorBatch]:
+    """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales."""
+    known = np.isfinite(observations.depth)
+    seen = observations.select(known)
+    return [
+        static_depth_prior(
+            seen.frame, row[known], seen.frame,
+            depth=seen.depth, sigma=sigma, weight=seen.weight, kernel=kernel_of(config.depth_kernel),
+        ),
+        log_scale_prior(
+            np.arange(num_frames), measured=np.zeros((num_frames, 1)), sigma=config.depth_scale_prior_sigma
+        ),
+    ]  # fmt: skip
+
+
+def scale_anchors(world_T_cam: FloatArray, sigma_m: float) -> list[FactorBatch]:
+    """Hold the distance between frame 0 and the camera farthest from it; empty for a camera at rest."""
+    distance = np.linalg.norm(world_T_cam[:, :3, 3] - world_T_cam[0, :3, 3], axis=1)
+    farthest = int(np.argmax(distance))
+    if distance[farthest] < 1e-6:
+        return []
+    return [scale_anchor(0, farthest, distance=distance[[farthest]], sigma=sigma_m)]
+
+
+def adjust_bundle(
+    observations: Observations,
+    start: Cameras,
+    prior_intrinsics: FloatArray,
+    config: BundleAdjustmentConfig,
+    freedom: Freedom,
+    energy: Energy = MAP,
+    hooks: Hooks | None = None,
+    run: StageRunner = run_stage,
+) -> StaticScene:
+    """Run stage 2 from the poses and intrinsics of stage 1.
+
+    Args:
+        observations: Trusted observations of static tracks.
+        start: Starting cameras; their log-scales start at zero.
+        prior_intrinsics: (4,) the sequence's own intrinsics.
+        config: Stage 2.
+        freedom: Whether poses and intrinsics move.
+        energy: Weighs the terms.
+        hooks: Progress and cancellation.
+        run: What solves each declared stage.
+
+    Raises:
+        DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
+        SolverError: If the system is singular or a cue is not finite.
+    """
+    dropped: dict[str, int] = {}
+    start = Cameras(start.world_T_cam, start.intrinsics, np.zeros(len(start.world_T_cam)))
+    observations, landmarks = _liftable(observations, start, config, dropped)
+    if len(observations) == 0:
+        raise DegenerateProblemError(
+            "bundle adjustment: no static track has depth in any frame and is seen in "
+            f"{config.min_observations} frames. Check masks and depth with 'uni4d-fg validate'."
+        )
+    state = start.state(landmarks, observations.rows()[0])
+    noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma, config.depth_correlation)
+    solves: list[SolveSummary] = []
+    covariances = unknown_covariances(len(start.world_T_cam))
+    rounds = 2 if energy.is_likelihood and config.measure_noise else 1
+    for index in range(rounds):
+        problem = bundle_adjustment_problem(state, observations, noise, config, prior_intrinsics[None], freedom, energy)
+        stage = Stage("bundle_adjustment", problem, config.solver)
+        state, summary = run(stage, state, hooks)
+        solves.append(summary)
+        if summary.termination is Termination.CANCELLED:
+            break
+        if config.depth_prior and freedom.poses and HOLDS_SCALE not in summary.notes:
+            state = hold_metric_scale(state)
+        if index == rounds - 1 and energy.is_likelihood:
+            covariances = _covariances(stage, state, observations, config)
+        state, observations = drop_outliers(state, observations, config, dropped)
+        if len(observations) == 0:
+            counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)
+            raise DegenerateProblemError(
+                f"bundle adjustment: every observation was dropped in round {index + 1} ({counts}); "
+                "check intrinsics and masks, or raise max_reprojection_px and max_depth_ratio"
+            )
+        noise = measure_noise(state, observations, noise, config)
+    if config.structure == "refine" and energy.is_likelihood and solves[-1].termination is not Termination.CANCELLED:
+        state, noise, refined = refine_structure(state, observations, noise, config, hooks, run)
+        solves += refined
+    if config.structure == "relift":
+        state = relift_structure(state, observations)
+    keep = spatial_inliers(state[LANDMARK], config)
+    dropped["landmark far from its neighbours"] = int((~keep).sum())
+    if not keep.any():
+        raise DegenerateProblemError(
+            f"bundle adjustment: all {len(keep)} landmarks are dropped as far from their neighbours; "
+            "raise outlier_factor or outlier_quantile"
+        )
+    track = state.numbers(LANDMARK)[:, 0]
+    error = landmark_errors(state, observations)[keep]
+    observations = observations.select(np.isin(observations.track, track[keep]))
+    return StaticScene(
+        Cameras.of(state), state[LANDMARK][keep], track[keep], observations, noise, error,
+        *covariances, solves, dropped,
+    )  # fmt: skip
+
+
+def refine_structure(
+    state: State,
+    observations: Observations,
+    noise: StaticNoise,
+    config: BundleAdjustmentConfig,
+    hooks: Hooks | None = None,
+    run: StageRunner = run_stage,
+) -> tuple[State, StaticNoise, list[SolveSummary]]:
+    """Solve landmarks and frame scales under frozen cameras; return the state, the noise and the solves.
+
+    Twice: the second solve uses the depth noise that the first one reveals.
+    """
+    solves = []
+    for _ in range(2):
+        problem = structure_problem(state, observations, noise, config)
+        state, summary = run(Stage("structure", problem, config.structure_solver), state, hooks)
+        solves.append(summary)
+        noise = measure_noise(state, observations, noise, config)
+    return state, noise, solves
+
+
+def relift_structure(state: State, observations: Observations) -> State:
+    """Put every landmark at the mean lift of its depth cues, where it has any."""
+    landmarks = state[LANDMARK]
+    _, row = observations.rows()
+    lifted = mean_per_row(lift(observations, Cameras.of(state)), observations.weight, row, len(landmarks))
+    return state.replace({LANDMARK: np.where(np.isfinite(lifted), lifted, landmarks)})
+
+
+def hold_metric_scale(state: State) -> State:
+    """Scale the world about frame 0's center so that the frames' log-scales have zero mean.
+
+    Reprojection does not see the scale of the world, and the widened depth prior holds it weakly: the cue's
+    mean over all frames is the best metric scale there is.
+    """
+    log_scale = state[LOG_SCALE]
+    shift = float(np.mean(log_scale[:, 0]))
+    factor = np.exp(-shift)
+    poses = state[POSE].copy()
+    center = poses[0, :3, 3].copy()
+    poses[:, :3, 3] = center + factor * (poses[:, :3, 3] - center)
+    landmarks = center + factor * (state[LANDMARK] - center)
+    return state.replace({POSE: poses, LOG_SCALE: log_scale - shift, LANDMARK: landmarks})
+
+
+def _covariances(
+    stage: Stage, state: State, observations: Observations, config: BundleAdjustmentConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Return the marginal covariances of poses and intrinsics at the end of a MAP solve."""
+    marginals = static_marginals(stage, state, track_cells(observations, state[INTRINSICS][0], config))
+    if marginals is None:
+        return unknown_covariances(len(state[POSE]))
+    return marginals.blocks(POSE, len(state[POSE])), marginals.blocks(INTRINSICS, 1)[0]
+
+
+def _liftable(
+    observations: Observations, cameras: Cameras, config: BundleAdjustmentConfig, dropped: dict[str, int]
+) -> tuple[Observations, FloatArray]:
+    """Keep tracks that are long enough and have depth; return them with their starting landmarks."""
+    before = len(np.unique(observations.track))
+    observations = observations.with_min_observations(min(config.min_observations, len(cameras.world_T_cam)))
+    tracks, row = observations.rows()
+    dropped["track with too few observations"] = before - len(tracks)
+    landmarks = mean_per_row(lift(observations, cameras), observations.weight, row, len(tracks))
+    known = np.asarray(np.isfinite(landmarks).all(axis=1))
+    dropped["track without depth"] = int((~known).sum())
+    return observations.select(known[row]), landmarks[known]

@@ -1,0 +1,52 @@
+"""Points from depth: the starting values of landmarks, dynamic points and frame scales."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.geometry.camera import camera_to_world, unproject, world_to_camera
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.scene import Cameras
+
+
+def lift(observations: Observations, cameras: Cameras) -> FloatArray:
+    """Lift every observation with its scaled depth cue to the world.
+
+    Args:
+        observations: N observations.
+        cameras: The cue of frame t is multiplied by exp(log_scale[t]).
+
+    Returns:
+        (N, 3) world points, m; NaN where the cue is missing.
+    """
+    depth = observations.depth * np.exp(cameras.log_scale[observations.frame])
+    x: FloatArray = unproject(cameras.intrinsics, observations.uv, depth)
+    result: FloatArray = camera_to_world(cameras.world_T_cam[observations.frame], x)
+    return result
+
+
+def mean_per_row(values: FloatArray, weight: FloatArray, row: IntArray, count: int) -> FloatArray:
+    """Average (N, 3) values per row, ignoring NaN; rows without a finite value are NaN. Returns (count, 3)."""
+    usable = np.isfinite(values).all(axis=1)
+    w = np.where(usable, weight, 0.0)
+    total = np.bincount(row, w, count)
+    sums = np.stack([np.bincount(row, w * np.where(usable, values[:, a], 0.0), count) for a in range(3)], axis=1)
+    out: FloatArray = np.full((count, 3), np.nan)
+    out[total > 0] = sums[total > 0] / total[total > 0, None]
+    return out
+
+
+def frame_log_scales(
+    observations: Observations, world_T_cam: FloatArray, points: FloatArray, num_frames: int
+) -> FloatArray:
+    """Return per frame the median of log(z of the point) - log(cue), (T,); 0 where a frame has none."""
+    z = world_to_camera(world_T_cam[observations.frame], points)[:, 2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.log(np.maximum(z, 1e-6)) - np.log(observations.depth)
+    out = np.zeros(num_frames)
+    for t in range(num_frames):
+        of_frame = ratio[(observations.frame == t) & np.isfinite(ratio)]
+        if len(of_frame):
+            out[t] = np.median(of_frame)
+    return out

@@ -1,0 +1,72 @@
+"""Track observations as flat arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N observations, sorted by track and then by frame."""
+
+    track: IntArray
+    """(N,) index in the labelled tracks."""
+    frame: IntArray
+    """(N,)."""
+    uv: FloatArray
+    """(N, 2) px."""
+    depth: FloatArray
+    """(N,) depth cue, m; NaN where missing."""
+    weight: FloatArray
+    """(N,) in (0, 1]."""
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+    def select(self, keep: BoolArray | IntArray) -> Observations:
+        """Return the observations picked by a mask or by indices."""
+        return Observations(self.track[keep], self.frame[keep], self.uv[keep], self.depth[keep], self.weight[keep])
+
+    def with_min_observations(self, count: int) -> Observations:
+        """Drop the observations of tracks that have fewer than ``count``."""
+        if len(self) == 0:
+            return self
+        return self.select(np.bincount(self.track)[self.track] >= count)
+
+    def rows(self) -> tuple[IntArray, IntArray]:
+        """Return the distinct tracks (M,), ascending, and the row of each observation among them (N,)."""
+        tracks, row = np.unique(self.track, return_inverse=True)
+        return tracks, row.astype(np.int64)
+
+
+def observations_of(labelled: LabelledTracks, *labels: TrackLabel) -> Observations:
+    """Collect the trusted observations (weight > 0) of all tracks with one of the labels."""
+    wanted = np.isin(labelled.label, [int(label) for label in labels])
+    track, frame = np.nonzero((labelled.weight > 0) & wanted[:, None])
+    return Observations(
+        track.astype(np.int64),
+        frame.astype(np.int64),
+        labelled.tracks.uv[track, frame].astype(np.float64),
+        labelled.depth[track, frame].astype(np.float64),
+        labelled.weight[track, frame].astype(np.float64),
+    )
+
+
+def weigh_by_drift(observations: Observations, query_frame: Int32Array, drift_frames: float) -> Observations:
+    """Lower the weight of observations far from their track's query frame: ``w / (1 + |t - q| / drift_frames)``.
+
+    A tracker that follows a point from frame to frame accumulates a random walk, whose variance grows
+    linearly with the number of steps.
+
+    Args:
+        observations: N observations.
+        query_frame: (K,) frame in which each track was started.
+        drift_frames: Steps after which the variance has doubled.
+    """
+    steps = np.abs(observations.frame - query_frame[observations.track])
+    return replace(observations, weight=observations.weight / (1.0 + steps / drift_frames))

@@ -1,0 +1,93 @@
+"""What of a static scene is trusted: residuals, outliers, and the noise that is left."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from uni4d_fg.config.stages import BundleAdjustmentConfig
+from uni4d_fg.factors.depth_prior import static_depth_prior
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.static_reprojection import static_reprojection
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.slam.stages.noise import intraclass_correlation, robust_sigma
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.scene import StaticNoise
+
+
+def reprojection_residual(state: State, observations: Observations, row: IntArray) -> FloatArray:
+    """Return the raw reprojection residual of every observation, (N, 2) px; ``row`` is its landmark's row."""
+    pose, landmark = state[POSE][observations.frame], state[LANDMARK][row]
+    residual: FloatArray = static_reprojection.residual(pose, landmark, state[INTRINSICS], uv=observations.uv)
+    return residual
+
+
+def landmark_errors(state: State, observations: Observations) -> Float32Array:
+    """Return each landmark's median reprojection error, (N,) px."""
+    tracks, row = observations.rows()
+    residual = reprojection_residual(state, observations, row)
+    norm = np.linalg.norm(residual, axis=1)
+    order = np.lexsort([norm, row])
+    start = np.searchsorted(row[order], np.arange(len(tracks) + 1))
+    middle = (start[:-1] + start[1:] - 1) // 2
+    return np.asarray(norm[order][middle], dtype=np.float32)
+
+
+def drop_outliers(
+    state: State, observations: Observations, config: BundleAdjustmentConfig, dropped: dict[str, int]
+) -> tuple[State, Observations]:
+    """Drop observations behind the camera, too far off, or of landmarks whose depth contradicts the cue."""
+    tracks, row = observations.rows()
+    z = world_to_camera(state[POSE][observations.frame], state[LANDMARK][row])[:, 2]
+    residual = reprojection_residual(state, observations, row)
+    behind = z <= NEAR_PLANE
+    far = ~behind & (np.linalg.norm(residual, axis=1) > config.max_reprojection_px)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.abs(np.log(np.maximum(z, NEAR_PLANE) / observations.depth) - state[LOG_SCALE][observations.frame, 0])
+    known = np.isfinite(ratio)
+    wrong = np.bincount(row[known], ratio[known] > np.log(config.max_depth_ratio), len(tracks))
+    contradicted = (wrong > 0.5 * np.bincount(row[known], minlength=len(tracks))) & (wrong > 0)
+    keep = ~(behind | far | contradicted[row])
+    kept = observations.select(keep).with_min_observations(min(config.min_observations, len(state[POSE])))
+    stays = np.isin(tracks, kept.track)
+    for reason, count in (
+        ("observation behind the camera", int(behind.sum())),
+        ("observation with a large reprojection error", int(far.sum())),
+        ("landmark whose depth contradicts the cue", int(contradicted.sum())),
+        ("landmark left with too few observations", int((~stays & ~contradicted).sum())),
+    ):
+        dropped[reason] = dropped.get(reason, 0) + count
+    arrays = {**state.arrays, LANDMARK: state[LANDMARK][stays]}
+    return State(arrays, {**state.index, LANDMARK: tracks[stays]}), kept
+
+
+def measure_noise(
+    state: State, observations: Observations, noise: StaticNoise, config: BundleAdjustmentConfig
+) -> StaticNoise:
+    """Measure the noise of the static scene from what is left."""
+    _, row = observations.rows()
+    pose, landmark = state[POSE][observations.frame], state[LANDMARK][row]
+    reprojection = reprojection_residual(state, observations, row)
+    known = np.isfinite(observations.depth)
+    depth = static_depth_prior.residual(
+        pose[known], landmark[known], state[LOG_SCALE][observations.frame[known]], depth=observations.depth[known]
+    )
+    pixel, relative = robust_sigma(reprojection), robust_sigma(depth)
+    return StaticNoise(
+        max(pixel * config.reprojection_sigma_factor, config.min_reprojection_sigma_px),
+        max(relative, config.min_depth_sigma) if np.isfinite(relative) else noise.depth_sigma,
+        intraclass_correlation(depth[:, 0], row[known]) if np.isfinite(relative) else noise.depth_correlation,
+    )
+
+
+def spatial_inliers(landmarks: FloatArray, config: BundleAdjustmentConfig) -> BoolArray:
+    """Return which landmarks are not isolated: mean squared distance to 5 neighbours below the quantile rule."""
+    if len(landmarks) < 7:
+        return np.ones(len(landmarks), dtype=bool)
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(landmarks).query(landmarks, k=6)
+    score = np.mean(distance[:, 1:] ** 2, axis=1)
+    result: BoolArray = score <= config.outlier_factor * np.quantile(score, config.outlier_quantile)
+    return result

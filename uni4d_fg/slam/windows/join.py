@@ -1,0 +1,236 @@
+r"""Joining windows: every window's information on its cameras, summed, and solved for all frames together.
+
+With its landmarks eliminated a window says, about its own linearization point,
+
+    E_w(d) = 1/2 d^T H d + g^T d,     d_i = Log(P_i^{-1} (T_0^{-1} T_i)),   d_s = s - s_0,   d_K = K - K_0,
+
+where T_0 is the pose of its first frame: only poses relative to it, log-scales and intrinsics, so that a window
+knows nothing of where the others put the world. The sum over windows is minimised by Gauss-Newton over all poses
+(frame 0 held) and log-scales; the intrinsics are held, as short windows tell them worse than frames far apart do, and
+count as uncertain as these say in the covariances. The matrix has one block per window and a border for the
+intrinsics, and is factorised as a sparse one.
+Source: Ni, Steedly and Dellaert 2007, "Tectonic SAM: exact, out-of-core, submap-based SLAM".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+
+from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.errors import SolverError
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.se3 import inverse_right_jacobian, se3_log
+from uni4d_fg.optim.cluster_robust import MIN_CLUSTERS, Spread
+from uni4d_fg.slam.stages.scene import Cameras
+from uni4d_fg.slam.windows.plan import Window
+
+_STEP_SIZE = 1e-9
+"""A Gauss-Newton step below this ends the solve (rad, m, log)."""
+_MAX_STEPS = 10
+_FRAME = 7
+"""Columns per frame: twist, log-scale. The intrinsics' four stand at the end."""
+
+
+@dataclass(frozen=True)
+class WindowInformation:
+    """What one window knows: columns are 7 per frame (twist, log-scale) and 4 for the intrinsics."""
+
+    window: Window
+    point: Cameras
+    """Linearization point, in the axes of the window's first camera."""
+    hessian: FloatArray
+    """(n, n); zero in the columns of the first pose."""
+    gradient: FloatArray
+    """(n,)."""
+    curvature: FloatArray
+    """(n, n) the Hessian with the mean slopes of the kernels, for covariances."""
+    spread: Spread | None
+    """Of the gradient; None where errors count as independent."""
+
+    def columns(self, num_frames: int) -> IntArray:
+        """Return the place (n,) of its columns among those of all frames."""
+        frames = np.arange(_FRAME * self.window.start, _FRAME * self.window.stop)
+        return np.concatenate([frames, _FRAME * num_frames + np.arange(4)])
+
+    def difference(self, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
+        """Return d (n,) and its Jacobian (n, n) with respect to the shared cameras' tangents."""
+        here, count = cameras.part(self.window.start, self.window.stop), len(self.window)
+        twist = se3_log(se3.inverse(self.point.world_T_cam) @ here.world_T_cam)
+        inverse_jacobian = inverse_right_jacobian(twist)
+        d, jacobian = np.zeros(_FRAME * count + 4), np.eye(_FRAME * count + 4)
+        for i in range(count):
+            own = slice(_FRAME * i, _FRAME * i + 6)
+            d[own] = twist[i]
+            jacobian[own, own] = inverse_jacobian[i] if i else 0.0
+            if i:
+                back = se3.adjoint(se3.inverse(here.world_T_cam[i]))
+                jacobian[own, :6] = -inverse_jacobian[i] @ back
+        d[6 : _FRAME * count : _FRAME] = here.log_scale - self.point.log_scale
+        d[-4:] = here.intrinsics - self.point.intrinsics
+        return d, jacobian
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The solution, and how sure it is."""
+
+    cameras: Cameras
+    pose_covariance: FloatArray
+    """(T, 6, 6)."""
+    intrinsics_covariance: FloatArray
+    """(4, 4)."""
+
+
+def chain(windows: list[Window], parts: list[Cameras]) -> Cameras:
+    """Put windows one behind the other by the poses they share, as a start.
+
+    A window is placed by the mean, over the shared frames, of where the earlier one puts its first camera.
+    """
+    num_frames = windows[-1].stop
+    poses, scales = np.tile(np.eye(4), (num_frames, 1, 1)), np.zeros(num_frames)
+    done = 0
+    for window, part in zip(windows, parts, strict=True):
+        shared = np.arange(window.start, done)
+        world = np.eye(4)
+        if len(shared):
+            found = poses[shared] @ se3.inverse(part.world_T_cam[shared - window.start])
+            twist = se3_log(se3.inverse(found[:1]) @ found)
+            world = found[0] @ se3.se3_exp(twist.mean(axis=0)[None])[0]
+        new = np.arange(done, window.stop)
+        poses[new] = se3.orthonormalize(world @ part.world_T_cam[new - window.start])
+        scales[new] = part.log_scale[new - window.start]
+        done = window.stop
+    intrinsics = np.mean([part.intrinsics for part in parts], axis=0)
+    return Cameras(poses, intrinsics, scales)
+
+
+def join(
+    information: list[WindowInformation], start: Cameras, intrinsics_covariance: FloatArray, *, covariance: bool
+) -> Joined:
+    """Minimise the windows' energies together.
+
+    Args:
+        information: Of every window.
+        start: Where to start; its intrinsics stay.
+        intrinsics_covariance: (4, 4) of these; zero for those that are known.
+        covariance: Whether to compute covariances; NaN otherwise.
+
+    Raises:
+        SolverError: If the windows do not determine a camera.
+    """
+    cameras, num_frames = start, len(start.world_T_cam)
+    size = _FRAME * num_frames + 4
+    free = np.ones(size, dtype=bool)
+    free[:6] = False
+    free[-4:] = False
+    at = np.flatnonzero(free)
+    for _ in range(_MAX_STEPS):
+        gradient, blocks = np.zeros(size), []
+        for part in information:
+            d, jacobian = part.difference(cameras)
+            blocks.append(jacobian.T @ part.hessian @ jacobian)
+            gradient[part.columns(num_frames)] += jacobian.T @ (part.hessian @ d + part.gradient)
+        solver = _factorise(information, blocks, num_frames, at)
+        step = np.zeros(size)
+        step[at] = -solver.solve(gradient[at])
+        if not np.isfinite(step).all():
+            raise SolverError("joining windows: a step is not finite; use longer windows or a wider overlap")
+        cameras = _moved(cameras, step)
+        if np.abs(step).max() < _STEP_SIZE:
+            break
+    if not covariance:
+        return Joined(cameras, np.full((num_frames, 6, 6), np.nan), np.full((4, 4), np.nan))
+    uncertain = size - 4 + np.flatnonzero(np.diag(intrinsics_covariance) > 0)
+    known = np.zeros((4, 4))
+    inside = np.ix_(uncertain - size + 4, uncertain - size + 4)
+    known[inside] = np.linalg.inv(intrinsics_covariance[inside])
+    return Joined(cameras, *_covariances(information, cameras, np.concatenate([at, uncertain]), known))
+
+
+def _moved(cameras: Cameras, step: FloatArray) -> Cameras:
+    frames = step[:-4].reshape(-1, _FRAME)
+    poses = se3.orthonormalize(se3.retract(cameras.world_T_cam, frames[:, :6]))
+    return Cameras(poses, cameras.intrinsics + step[-4:], cameras.log_scale + frames[:, 6])
+
+
+def _factorise(
+    information: list[WindowInformation], blocks: list[FloatArray], num_frames: int, at: IntArray
+) -> scipy.sparse.linalg.SuperLU:
+    size = _FRAME * num_frames + 4
+    rows, columns, values = [], [], []
+    for part, block in zip(information, blocks, strict=True):
+        place = part.columns(num_frames)
+        rows.append(np.repeat(place, len(place)))
+        columns.append(np.tile(place, len(place)))
+        values.append(block.reshape(-1))
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    matrix = scipy.sparse.csc_matrix(entries, shape=(size, size))[at][:, at].tocsc()
+    try:
+        return scipy.sparse.linalg.splu(
+            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError as error:
+        raise SolverError(
+            "joining windows: the windows do not determine every camera; use longer windows or a wider overlap"
+        ) from error
+
+
+def _covariances(
+    information: list[WindowInformation], cameras: Cameras, at: IntArray, known: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return pose (T, 6, 6) and intrinsics (4, 4) covariances; see :mod:`uni4d_fg.optim.cluster_robust`.
+
+    The sum over clusters, and over factors without landmarks, is taken through one solve per cluster and one per
+    direction in which a window's other factors know anything.
+    """
+    num_frames = len(cameras.world_T_cam)
+    size = _FRAME * num_frames + 4
+    jacobians = [part.difference(cameras)[1] for part in information]
+    curvatures = [j.T @ part.curvature @ j for part, j in zip(information, jacobians, strict=True)]
+    curvatures[0][-4:, -4:] += known
+    solver = _factorise(information, curvatures, num_frames, at)
+    poses, intrinsics = np.zeros((num_frames, 6, 6)), np.zeros((4, 4))
+
+    def add(sides: FloatArray, factor: float = 1.0) -> None:
+        """Add the outer products of the solutions of (m, size) right-hand sides."""
+        solved = np.zeros_like(sides)
+        solved[:, at] = solver.solve(np.ascontiguousarray(sides[:, at].T)).T
+        frames = solved[:, :-4].reshape(len(sides), num_frames, _FRAME)[:, :, :6]
+        poses[:] += factor * np.einsum("mti,mtj->tij", frames, frames, optimize=True)
+        intrinsics[:] += factor * solved[:, -4:].T @ solved[:, -4:]
+
+    spreads = [part.spread for part in information]
+    scores = None
+    if all(spread is not None for spread in spreads):
+        count = max(len(spread.scores) for spread in spreads if spread is not None)
+        scores = np.zeros((count, size))
+        for part, j in zip(information, jacobians, strict=True):
+            assert part.spread is not None
+            scores[:, part.columns(num_frames)] += part.spread.scores @ j
+        used = int(np.any(scores != 0.0, axis=1).sum())
+        if used < MIN_CLUSTERS:
+            scores = None
+        else:
+            add(scores, used / (used - 1.0))
+    calibrated = np.zeros((4, size))
+    calibrated[:, -4:] = _root(known)
+    add(calibrated)
+    for part, j in zip(information, jacobians, strict=True):
+        rest = part.curvature if scores is None or part.spread is None else part.spread.rest
+        sides = np.zeros((len(rest), size))
+        sides[:, part.columns(num_frames)] = _root(rest) @ j
+        add(sides[np.any(sides != 0.0, axis=1)])
+    return poses, intrinsics
+
+
+def _root(matrix: FloatArray) -> FloatArray:
+    """Return R with ``R^T R = matrix`` for a symmetric one without negative directions."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / scale[:, None] / scale)
+    values = np.where(values > 1e-12 * max(float(values[-1]), 1e-300), values, 0.0)
+    result: FloatArray = np.sqrt(values)[:, None] * vectors.T * scale
+    return result
