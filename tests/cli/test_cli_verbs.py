@@ -309,17 +309,3 @@ def test_debug_shows_the_traceback(
     monkeypatch.setattr(reconstruction, "run_pipeline", fail)
     assert main.run(["reconstruct", str(scene), "--out", str(tmp_path / "r"), "--debug"]) == 70
     assert "Traceback" in capsys.readouterr().err
-
-
-def test_the_readme_example_runs(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    readme = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
-    example = readme.split("```python\n")[1].split("```")[0]
-    (tmp_path / "my_video").symlink_to(scene)
-    monkeypatch.chdir(tmp_path)
-    exec(compile(example, "README.md", "exec"), {})
-    out = capsys.readouterr().out
-    assert "bundle_adjustment" in out
-    assert "(8, 4, 4)" in out
-    assert (tmp_path / "runs" / "library" / "pictures" / "scene.png").exists()
