@@ -47,5 +47,7 @@ def graph(
             typer.echo(
                 f"    {name:22s} {term.factors:8d} factors, energy {term.initial_energy:.6g} -> {term.final_energy:.6g}"
             )
+        for name, missing in summary.left_out.items():
+            typer.echo(f"    {name:22s} {missing:8d} factors not stored: they exist as Python functions alone")
         for name, residual, variables in summary.worst:
             typer.echo(f"    {residual:8.2f} sigma  {name} on {variables}")

@@ -1,7 +1,8 @@
 """A solved problem in a file: batches, free entries and both states as plain arrays, nothing pickled.
 
 Batches are stored by the name of their factor type and read back through the declarations; GTSAM's own factors are
-stored as GTSAM writes them. Arrays are kept in single precision where nothing is lost by it: pixels mostly are.
+stored as GTSAM writes them. Arrays are kept as small as they can be without a loss: one row where all are equal, row
+numbers in the smallest integers that hold them, single precision where it is exact (pixels mostly are).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from uni4d_fg.arrays import IntArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.factors import terms as _declared  # noqa: F401 - declares the factor types that a file may name
 from uni4d_fg.factors.batch import FactorBatch, Slot
@@ -31,7 +33,7 @@ def save_stage_graph(path: Path, stage: StageGraph) -> None:
     """Write a solved stage.
 
     Factors that exist as Python functions alone (a user's ``gtsam.CustomFactor``, priors that marginalization left)
-    are counted and left out.
+    are counted and left out, see :attr:`StageGraph.left_out`.
 
     Raises:
         OutputError: If the file cannot be written.
@@ -47,12 +49,13 @@ def save_stage_graph(path: Path, stage: StageGraph) -> None:
         header["batches"].append(
             {
                 "place": i,
+                "count": len(batch),
                 "type": batch.factor_type.name,
                 "term": batch.term,
                 "kernel": [batch.kernel.kind, batch.kernel.threshold],
             }
         )
-        arrays |= {f"rows_{i}_{j}": slot.rows.astype(np.int32) for j, slot in enumerate(batch.slots)}
+        arrays |= {f"rows_{i}_{j}": _shrunk_rows(slot.rows) for j, slot in enumerate(batch.slots)}
         arrays |= {f"data_{i}_{name}": _shrunk(array) for name, array in batch.data.items()}
         arrays |= {f"sigma_{i}": _shrunk(batch.sigma), f"weight_{i}": _shrunk(batch.weight)}
     header["variables"] = [variable.name for variable in stage.final_state.arrays]
@@ -85,12 +88,13 @@ def load_stage_graph(path: Path) -> StageGraph:
                     f"{path}: has factors of type '{entry['type']}', which is not declared; import its module first"
                 )
             declared, i = known[entry["type"]], entry["place"]
+            count = int(entry["count"])
             slots = tuple(
-                Slot(variable, arrays[f"rows_{i}_{j}"].astype(np.int64))
+                Slot(variable, _all_rows(arrays[f"rows_{i}_{j}"], count).astype(np.int64))
                 for j, variable in enumerate(declared.variables)
             )
-            data = {name: arrays[f"data_{i}_{name}"].astype(np.float64) for name in declared.data}
-            sigma, weight = (arrays[f"{name}_{i}"].astype(np.float64) for name in ("sigma", "weight"))
+            data = {name: _all_rows(arrays[f"data_{i}_{name}"], count).astype(np.float64) for name in declared.data}
+            sigma, weight = (_all_rows(arrays[f"{n}_{i}"], count).astype(np.float64) for n in ("sigma", "weight"))
             kernel = Kernel(*entry["kernel"])
             batches.append(
                 FactorBatch.create(declared, slots, data, sigma=sigma, weight=weight, kernel=kernel, term=entry["term"])
@@ -101,10 +105,11 @@ def load_stage_graph(path: Path) -> StageGraph:
             batches += native_batches([graph.at(i) for i in range(graph.size())], final)
         free = {v: arrays[f"free_{v}"] for v in variables if f"free_{v}" in arrays}
         eliminated = header["eliminated"]
+        left_out = {str(name): int(count) for name, count in header["left_out"].items()}
     except (KeyError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(f"{path}: not a solved stage of this version ({error}); make the run again") from error
     problem = Problem(tuple(batches), free, None if eliminated is None else variable_type(eliminated))
-    return StageGraph(header["kind"], problem, initial, final)
+    return StageGraph(header["kind"], problem, initial, final, left_out)
 
 
 def _store_native(header: dict[str, Any], batch: FactorBatch, state: State) -> None:
@@ -122,6 +127,20 @@ def _store_native(header: dict[str, Any], batch: FactorBatch, state: State) -> N
 
 
 def _shrunk(array: npt.NDArray[np.float64]) -> npt.NDArray[Any]:
-    """Return an array in single precision if that is exact."""
+    """Return an array in single precision if that is exact, and one row of it if all are equal."""
+    if len(array) > 1 and (array == array[:1]).all():
+        array = array[:1]
     single = np.asarray(array, dtype=np.float32)
     return single if (single == array).all() else np.asarray(array)
+
+
+def _shrunk_rows(rows: IntArray) -> npt.NDArray[Any]:
+    """Return row numbers (n,) in the smallest integers that hold them, and one if all are equal."""
+    if len(rows) > 1 and (rows == rows[0]).all():
+        rows = rows[:1]
+    return rows.astype(np.min_scalar_type(int(rows.max(initial=0))))
+
+
+def _all_rows(array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
+    """Undo the shrinking of equal rows."""
+    return np.broadcast_to(array, (count, *array.shape[1:]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,8 @@ class StageGraph:
     problem: Problem
     initial_state: State
     final_state: State
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    """Factors that the solve had and a file could not hold, by term: those that exist as Python functions alone."""
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:

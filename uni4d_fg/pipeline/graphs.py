@@ -42,5 +42,6 @@ def write_graph_values(folder: RunFolder) -> dict[str, dict[str, int]]:
     for path in sorted(folder.graphs.glob("*.graph.npz")) if folder.graphs.is_dir() else ():
         stage = load_stage_graph(path)
         stage.write_values(folder.graphs)
-        sizes[stage.kind] = {"factors": int(stage.graph.size()), "variables": int(stage.final.size())}
+        factors = sum(len(batch) for batch in stage.problem.batches)
+        sizes[stage.kind] = {"factors": factors, "variables": int(stage.final.size())}
     return sizes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import gtsam
@@ -39,6 +39,8 @@ class GraphSummary:
     terms: dict[str, TermSummary]
     worst: list[tuple[str, float, str]]
     """Term, whitened residual norm and variables of the largest residuals."""
+    left_out: dict[str, int] = field(default_factory=dict)
+    """Factors that the solve had and the file does not hold, by term."""
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -52,6 +54,7 @@ class GraphSummary:
             "variables": {name: {"count": n, "free": free} for name, (n, free) in self.variables.items()},
             "terms": {name: vars(term) for name, term in self.terms.items()},
             "degrees_of_freedom": self.degrees_of_freedom,
+            "left_out": self.left_out,
             "worst": [{"term": t, "residual": r, "variables": v} for t, r, v in self.worst],
         }
 
@@ -90,7 +93,7 @@ def summarize_graph(stage: StageGraph, worst: int = 5) -> GraphSummary:
         for row in np.argsort(size)[::-1][:worst].tolist():
             largest.append((batch.name, float(size[row]), batch.describe_row(row, final)))
     largest.sort(key=lambda entry: -entry[1])
-    return GraphSummary(stage.kind, variables, terms, largest[:worst])
+    return GraphSummary(stage.kind, variables, terms, largest[:worst], dict(stage.left_out))
 
 
 def write_dot(stage: StageGraph, path: Path) -> None:
