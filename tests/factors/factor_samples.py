@@ -13,7 +13,14 @@ import uni4d_fg.factors
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.factors import FactorType, VariableType, factor_types
 from uni4d_fg.factors.variable import SE3, Manifold
-from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS, LANDMARK, OBJECT_POINT
+from uni4d_fg.factors.variable_types import (
+    DYNAMIC_POINT,
+    FISHEYE_CAMERA,
+    INTRINSICS,
+    LANDMARK,
+    OBJECT_POINT,
+    OPENCV_CAMERA,
+)
 
 N = 6
 SPREAD = 0.3
@@ -21,6 +28,8 @@ SPREAD = 0.3
 
 PHYSICAL: Mapping[VariableType, tuple[list[float], list[float]]] = {
     INTRINSICS: ([450, 450, 300, 200], [600, 600, 340, 260]),
+    OPENCV_CAMERA: ([450, 450, 300, 200, -0.3, -0.1, -0.01, -0.01], [600, 600, 340, 260, 0.3, 0.1, 0.01, 0.01]),
+    FISHEYE_CAMERA: ([150, 150, 300, 200, -0.1, -0.02, -0.01, -0.01], [250, 250, 340, 260, 0.1, 0.02, 0.01, 0.01]),
     LANDMARK: ([-1, -1, 2], [1, 1, 5]),
     DYNAMIC_POINT: ([-1, -1, 2], [1, 1, 5]),
     OBJECT_POINT: ([-1, -1, 2], [1, 1, 5]),

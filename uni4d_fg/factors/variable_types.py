@@ -4,6 +4,8 @@
 |---|---|---|---|
 | ``POSE`` | x(frame) | (4, 4) ``world_T_cam`` | 6: body-frame (omega [rad], v [m]), ``T Exp(xi)`` |
 | ``INTRINSICS`` | k(camera) | (4,) fx, fy, cx, cy, px | 4 |
+| ``OPENCV_CAMERA`` | c(camera) | (8,) fx, fy, cx, cy, px, and k1, k2, p1, p2 | 8 |
+| ``FISHEYE_CAMERA`` | f(camera) | (8,) fx, fy, cx, cy, px, and k1, k2, k3, k4 | 8 |
 | ``LOG_SCALE`` | s(frame) | (1,) log-scale of a frame's depth cue | 1 |
 | ``LANDMARK`` | l(track) | (3,) world, m | 3 |
 | ``DYNAMIC_POINT`` | p(track, frame) | (3,) world, m | 3 |
@@ -23,6 +25,8 @@ from uni4d_fg.factors.variable import SE3, VariableType, vector_space
 
 CALIBRATION_COLUMNS = (0, 1, 3, 4)
 """Where fx, fy, cx, cy stand in the vector of a ``gtsam.Cal3_S2``; entry 2 is the skew."""
+LENS_COLUMNS = (*CALIBRATION_COLUMNS, 5, 6, 7, 8)
+"""The same in the vector of a ``gtsam.Cal3DS2`` or ``gtsam.Cal3Fisheye``, distortion parameters last."""
 
 
 def calibration(intrinsics: FloatArray) -> gtsam.Cal3_S2:
@@ -37,6 +41,27 @@ def _at_pose(values: gtsam.Values, key: int) -> FloatArray:
 
 def _at_calibration(values: gtsam.Values, key: int) -> FloatArray:
     return np.asarray(values.atCal3_S2(key).vector(), dtype=np.float64)[list(CALIBRATION_COLUMNS)]
+
+
+def _opencv_camera(camera: FloatArray) -> gtsam.Cal3DS2:
+    fx, fy, cx, cy, *lens = camera.tolist()
+    return gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, *lens)
+
+
+def _at_opencv_camera(values: gtsam.Values, key: int) -> FloatArray:
+    return np.asarray(values.atCal3DS2(key).vector(), dtype=np.float64)[list(LENS_COLUMNS)]
+
+
+def _fisheye_camera(camera: FloatArray) -> gtsam.Cal3Fisheye:
+    fx, fy, cx, cy, *lens = camera.tolist()
+    return gtsam.Cal3Fisheye(fx, fy, 0.0, cx, cy, *lens)
+
+
+def _at_fisheye_camera(values: gtsam.Values, key: int) -> FloatArray:
+    camera = values.atCal3Fisheye(key)
+    return np.array(
+        [camera.fx(), camera.fy(), camera.px(), camera.py(), camera.k1(), camera.k2(), camera.k3(), camera.k4()]
+    )
 
 
 def _at_point(values: gtsam.Values, key: int) -> FloatArray:
@@ -61,6 +86,14 @@ POSE = pose_variable("pose", "x", label="camera pose")
 INTRINSICS = VariableType(
     "intrinsics", "k", vector_space(4), ("camera",),
     to_gtsam=calibration, from_gtsam=_at_calibration, gtsam_columns=CALIBRATION_COLUMNS, gtsam_dim=5,
+)  # fmt: skip
+OPENCV_CAMERA = VariableType(
+    "opencv_camera", "c", vector_space(8), ("camera",), "camera with a lens",
+    to_gtsam=_opencv_camera, from_gtsam=_at_opencv_camera, gtsam_columns=LENS_COLUMNS, gtsam_dim=9,
+)  # fmt: skip
+FISHEYE_CAMERA = VariableType(
+    "fisheye_camera", "f", vector_space(8), ("camera",), "fisheye camera",
+    to_gtsam=_fisheye_camera, from_gtsam=_at_fisheye_camera, gtsam_columns=LENS_COLUMNS, gtsam_dim=9,
 )  # fmt: skip
 LOG_SCALE = VariableType("log_scale", "s", vector_space(1), label="depth log-scale")
 LANDMARK = point_variable("landmark", "l")
