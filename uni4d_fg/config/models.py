@@ -9,6 +9,7 @@ from pydantic import model_validator
 
 from uni4d_fg.config.adam import AdamConfig
 from uni4d_fg.config.base import Section, setting
+from uni4d_fg.config.camera import CameraConfig
 from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
 from uni4d_fg.config.geometric_depth import AffineDepthConfig, GeometricDepthConfig
 from uni4d_fg.config.incremental import IncrementalConfig
@@ -53,6 +54,7 @@ class Config(Section):
         basic=True,
     )
     input: InputConfig = setting(InputConfig(), "Use of what the sequence brings.", basic=True)
+    camera: CameraConfig = setting(CameraConfig(), "Camera model.", basic=True)
     tracking: TrackingConfig = setting(TrackingConfig(), "Built-in tracker.", basic=True)
     labels: LabelConfig = setting(LabelConfig(), "Track labels.", basic=True)
     camera_init: CameraInitConfig = setting(CameraInitConfig(), "Stage 1.", basic=True)

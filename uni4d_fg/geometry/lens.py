@@ -266,3 +266,7 @@ class Lens:
             small = bent < 1e-9
             scale = np.where(small, 1.0, np.tan(theta) / np.where(small, 1.0, bent))
         return np.where((known | small)[:, None], target * scale[:, None], np.nan)
+
+
+PINHOLE = Lens()
+"""No distortion."""

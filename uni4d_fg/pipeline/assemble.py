@@ -12,6 +12,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.pipeline.leftovers import remove_views
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.clouds import write_clouds
@@ -27,7 +28,9 @@ from uni4d_fg.slam.reconstruction import OBJECT_ARRAYS, Reconstruction
 ValueT = TypeVar("ValueT")
 
 
-def assemble(sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> Reconstruction:
+def assemble(
+    sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion: Arrays, lens: Lens = PINHOLE
+) -> Reconstruction:
     """Bring the stages' results into one :class:`Reconstruction`, with colours from the images."""
     landmark_track = scene["landmark_track"].astype(np.int32)
     dynamic_track = motion["track"].astype(np.int32)
@@ -49,6 +52,7 @@ def assemble(sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion
         dynamic_color=colors[len(landmark_track) :],
         pose_covariance=scene.get("pose_covariance"),
         intrinsics_covariance=scene.get("intrinsics_covariance"),
+        lens=lens,
         **{name: motion[name] for name in OBJECT_ARRAYS if name in motion},
     )
 
@@ -98,10 +102,10 @@ def write_views(
     if not (config.output.clouds or config.output.pictures):
         return
     depth = read_depth(folder.depth)
-    intrinsics, poses = reconstruction.intrinsics, reconstruction.world_T_cam
-    static = static_cloud(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion)
+    intrinsics, poses, lens = reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.lens
+    static = static_cloud(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, lens=lens)
     if config.output.clouds:
-        moving = dynamic_clouds(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion)
+        moving = dynamic_clouds(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, lens)
         write_clouds(folder, static, _until(should_stop, moving))
     _check(should_stop)
     if config.output.pictures:
@@ -110,7 +114,13 @@ def write_views(
 
         def dynamic(frame: int) -> tuple[np.ndarray, ImageArray]:
             return dynamic_cloud(
-                sequence.images[frame], depth[frame], sequence.masks[frame], intrinsics, poses[frame], config.fusion
+                sequence.images[frame],
+                depth[frame],
+                sequence.masks[frame],
+                intrinsics,
+                poses[frame],
+                config.fusion,
+                lens,
             )
 
         draw_scene(folder.scene_picture, reconstruction, static, dynamic)

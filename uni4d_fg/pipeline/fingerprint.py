@@ -36,6 +36,9 @@ def sequence_key(sequence: Sequence, should_stop: Callable[[], bool] | None = No
                 )
             _update(digest, array)
     _update(digest, sequence.intrinsics)
+    if not sequence.lens.is_pinhole:
+        digest.update(sequence.lens.model.encode())
+        _update(digest, sequence.lens.padded)
     _update(digest, sequence.timestamps)
     if sequence.initial_world_T_cam is not None:
         _update(digest, sequence.initial_world_T_cam)

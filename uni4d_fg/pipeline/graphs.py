@@ -7,11 +7,17 @@ from uni4d_fg.optim.problem_io import load_stage_graph
 from uni4d_fg.results.run_folder import RunFolder
 
 _KINDS = {
+    "lens": ("lens",),
     "camera_init": ("camera_init",),
     "bundle_adjustment": ("camera_init", "bundle_adjustment", "structure"),
     "nonrigid": ("nonrigid",),
 }
 """Kinds of solves that a step of the pipeline makes; in windows, stage 1 is part of bundle adjustment."""
+
+
+def kinds_of(step: str) -> tuple[str, ...]:
+    """Return the kinds of solves whose graphs a step of the pipeline leaves; others it makes on the way."""
+    return _KINDS.get(step, ())
 
 
 def remove_graphs(folder: RunFolder, step: str) -> None:
@@ -20,7 +26,7 @@ def remove_graphs(folder: RunFolder, step: str) -> None:
     Raises:
         OutputError: If one cannot be removed.
     """
-    kinds = _KINDS.get(step, ())
+    kinds = kinds_of(step)
     if step == "bundle_adjustment" and (folder.root / "stages" / "camera_init.npz").exists():
         kinds = kinds[1:]
     for kind in kinds:

@@ -29,8 +29,9 @@ from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
-from uni4d_fg.pipeline.graphs import remove_graphs, write_graph_values
+from uni4d_fg.pipeline.graphs import kinds_of, remove_graphs, write_graph_values
 from uni4d_fg.pipeline.leftovers import remove_leftovers
+from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
@@ -78,8 +79,9 @@ class _Run:
                 should_stop=self.should_stop,
             )
             record = compute(hooks)
-            for kind, solved in self.recorder.solved.items():
-                save_stage_graph(self.folder.graph(kind), solved)
+            for kind in kinds_of(name):
+                if kind in self.recorder.solved:
+                    save_stage_graph(self.folder.graph(kind), self.recorder.solved[kind])
             self.store.save(name, key, record)
             self.reporter.end()
         self._note(name, record.summary, time.perf_counter() - began, resumed)
@@ -165,10 +167,11 @@ def reconstruct(
     key = stage_key(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
-    key, scene, motion = _stages(run, key, labelled, windows, run_stage)
+    key, camera = _camera(run, key, labelled, run_stage)
+    key, scene, motion = _stages(run, key, *camera.apply(sequence, labelled, config), windows, run_stage)
     key = stage_key(key, config.fusion)
     _fuse(run, key, labelled, scene, motion)
-    reconstruction = assemble(sequence, labelled, scene, motion)
+    reconstruction = assemble(sequence, labelled, scene, motion, camera.lens)
     write_result(folder, reconstruction)
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
@@ -181,11 +184,27 @@ def reconstruct(
     return summary
 
 
+def _camera(run: _Run, key: str, labelled: LabelledTracks, run_stage: StageRunner) -> tuple[str, CameraModel]:
+    """Find the lens, where it is not given or ruled out; return the key so far and the camera."""
+    sequence, config = run.sequence, run.config
+    if not is_sought(sequence, config):
+        return key, known_camera(sequence, config)
+    stages = stage_key(key, config.camera, config.bundle_adjustment, config.windows.calibration_sightings)
+    found = run.step("lens", stages, lambda hooks: lens_step(sequence, labelled, config, hooks, run_stage))
+    camera = found_camera(found)
+    return key if camera.lens.is_pinhole else stages, camera
+
+
 def _stages(
-    run: _Run, key: str, labelled: LabelledTracks, windows: list[Window], run_stage: StageRunner
+    run: _Run,
+    key: str,
+    sequence: Sequence,
+    labelled: LabelledTracks,
+    config: Config,
+    windows: list[Window],
+    run_stage: StageRunner,
 ) -> tuple[str, Arrays, Arrays]:
     """Run stages 1 to 3, as one graph or in windows; return the key so far and the records of stages 2 and 3."""
-    sequence, config = run.sequence, run.config
     if windows:
         parts = WindowedRun(
             sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from uni4d_fg.errors import InputError, OutputError
 from uni4d_fg.files import load_npz, save_npz
+from uni4d_fg.geometry.lens import PARAMETERS, Lens
 from uni4d_fg.slam.reconstruction import OBJECT_ARRAYS, Reconstruction
 
 FORMAT_VERSION = 1
@@ -36,6 +37,8 @@ _LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
 _OPTIONAL: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "pose_covariance": ("float64", ("T", 6, 6)),
     "intrinsics_covariance": ("float64", (4, 4)),
+    "lens_model": ("int64", (1,)),
+    "lens_parameters": ("float64", (4,)),
     "object_instance": ("int32", ("J",)),
     "object_reference": ("int32", ("J",)),
     "object_observed": ("bool", ("J", "T")),
@@ -53,7 +56,10 @@ def save_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         OutputError: If it is not a valid reconstruction (it could not be read back) or cannot be written.
     """
     arrays = {name: np.asarray(getattr(reconstruction, name)) for name in _LAYOUT}
-    known = {name: getattr(reconstruction, name) for name in _OPTIONAL}
+    known = {name: getattr(reconstruction, name) for name in _OPTIONAL if not name.startswith("lens_")}
+    if not reconstruction.lens.is_pinhole:
+        known["lens_model"] = [list(PARAMETERS).index(reconstruction.lens.model)]
+        known["lens_parameters"] = reconstruction.lens.padded
     arrays |= {name: np.asarray(array) for name, array in known.items() if array is not None}
     problem = _problem(arrays)
     if problem:
@@ -82,7 +88,9 @@ def load_reconstruction(path: Path) -> Reconstruction:
         raise InputError(f"{path}: not a valid reconstruction: {problem}")
     values: dict[str, Any] = {name: array.astype((_LAYOUT | _OPTIONAL)[name][0]) for name, array in arrays.items()}
     height, width = values.pop("image_size").tolist()
-    return Reconstruction(image_size=(height, width), **values)
+    model, parameters = values.pop("lens_model", [0]), values.pop("lens_parameters", np.zeros(4))
+    lens = Lens.of(list(PARAMETERS)[int(model[0])], parameters)
+    return Reconstruction(image_size=(height, width), lens=lens, **values)
 
 
 def _problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
@@ -126,6 +134,12 @@ def _value_problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
         return "an observed dynamic point has no position"
     if np.isinf(arrays["landmark_error"]).any():
         return "landmark_error has an infinite value"
+    if ("lens_model" in arrays) != ("lens_parameters" in arrays):
+        return "of lens_model and lens_parameters there is only one"
+    if "lens_model" in arrays:
+        known = 0 <= int(arrays["lens_model"][0]) < len(PARAMETERS)
+        if not known or not np.isfinite(arrays["lens_parameters"]).all():
+            return "its camera model is unknown, or a distortion parameter is not finite"
     for name in _OPTIONAL:
         if name in arrays and np.isinf(arrays[name]).any():
             return f"{name} has an infinite value"

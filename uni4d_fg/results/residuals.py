@@ -76,7 +76,8 @@ def reprojection_residuals(reconstruction: Reconstruction, labelled: LabelledTra
     row, frame, points, uv = row[seen], frame[seen], points[seen], uv[seen]
     is_dynamic = (np.arange(len(seen)) >= len(static_row))[seen]
     in_camera = world_to_camera(reconstruction.world_T_cam[frame], points)
-    error = uv - np.asarray(project(reconstruction.intrinsics, in_camera))
+    intrinsics = reconstruction.intrinsics
+    error = uv - reconstruction.lens.real_pixels(intrinsics, np.asarray(project(intrinsics, in_camera)))
     return Residuals(row, frame, uv, error, in_camera[:, 2], is_dynamic)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 
 OBJECT_ARRAYS = (
     "object_instance",
@@ -57,6 +58,8 @@ class Reconstruction:
     first camera, see :mod:`uni4d_fg.optim.marginals`; NaN where it is not determined, None in files without it."""
     intrinsics_covariance: FloatArray | None = None
     """(4, 4) px^2, marginal; zero for entries that were held."""
+    lens: Lens = PINHOLE
+    """Distortion; the images are of this camera, the intrinsics those of its pinhole."""
     object_instance: Int32Array | None = None
     """(J,) mask ids of the moving instances that are rigid bodies; None, as all that follow, where none was sought."""
     object_reference: Int32Array | None = None

@@ -11,6 +11,7 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -80,6 +81,8 @@ class Video:
     """T label maps (H, W), int32."""
     intrinsics: FloatArray | None = None
     """(4,) fx, fy, cx, cy in px."""
+    lens: Lens = PINHOLE
+    """What is known of its distortion; the pinhole where nothing is."""
     tracks: Tracks | None = None
     root: Path | None = None
     """Folder or file it was read from, if any."""
@@ -124,6 +127,8 @@ class Sequence:
     """(T, 4, 4) poses to start from or to keep, as the config says."""
     tracks: Tracks | None = None
     """Long 2D point tracks, when the sequence brings them."""
+    lens: Lens = PINHOLE
+    """What is known of its distortion; the pinhole where nothing is."""
     ground_truth: GroundTruth = field(default_factory=GroundTruth)
 
     @property

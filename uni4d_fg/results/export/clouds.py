@@ -22,8 +22,9 @@ def static_cloud(run: Run) -> Cloud:
         return Cloud(result.landmarks, result.landmark_color)
     sequence, depth = run.need_sequence(), run.need_depth("a cloud")
     return build_static_cloud(
-        sequence.images, depth, sequence.masks, result.intrinsics, result.world_T_cam, run.config.fusion
-    )
+        sequence.images, depth, sequence.masks, result.intrinsics, result.world_T_cam, run.config.fusion,
+        lens=result.lens,
+    )  # fmt: skip
 
 
 def moving_cloud(run: Run, frame: int) -> Cloud:
@@ -43,5 +44,5 @@ def moving_cloud(run: Run, frame: int) -> Cloud:
     sequence, depth = run.need_sequence(), run.need_depth("a cloud")
     return dynamic_cloud(
         sequence.images[frame], depth[frame], sequence.masks[frame],
-        result.intrinsics, result.world_T_cam[frame], run.config.fusion,
+        result.intrinsics, result.world_T_cam[frame], run.config.fusion, result.lens,
     )  # fmt: skip

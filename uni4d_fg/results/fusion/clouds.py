@@ -13,6 +13,7 @@ from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.geometry.camera import camera_to_world, unproject
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.optional import import_open3d
 
 _POINTS_BETWEEN_MERGES = 2_000_000
@@ -36,6 +37,7 @@ def static_cloud(
     config: FusionConfig,
     *,
     band_px: int = 5,
+    lens: Lens = PINHOLE,
 ) -> Cloud:
     """Build the cloud of everything that does not move, over the whole video.
 
@@ -50,6 +52,7 @@ def static_cloud(
         world_T_cam: (T, 4, 4) camera to world, metres.
         config: Strides, voxel size and edge threshold.
         band_px: Width of the band around instances, px.
+        lens: Distortion of the images.
 
     Raises:
         InputError: If the maps of a frame differ in size.
@@ -60,7 +63,7 @@ def static_cloud(
     for frame in range(0, len(images), config.static_frame_stride):
         image, depth, mask = _maps(frame, images, depths, masks)
         keep = ~dilate(mask > 0, band_px) & ~depth_edges(depth, config.edge_relative_gradient)
-        part = lift(image, depth, keep, intrinsics, world_T_cam[frame], config.static_stride)
+        part = lift(image, depth, keep, intrinsics, world_T_cam[frame], config.static_stride, lens)
         parts.append(part)
         waiting += len(part.points)
         if waiting > _POINTS_BETWEEN_MERGES and config.static_voxel_m > 0.0:
@@ -75,11 +78,12 @@ def dynamic_clouds(
     intrinsics: FloatArray,
     world_T_cam: FloatArray,
     config: FusionConfig,
+    lens: Lens = PINHOLE,
 ) -> Iterator[Cloud]:
     """Yield the cloud of the moving instances of each frame in turn; arguments as in :func:`static_cloud`."""
     for frame in range(len(images)):
         image, depth, mask = _maps(frame, images, depths, masks)
-        yield dynamic_cloud(image, depth, mask, intrinsics, world_T_cam[frame], config)
+        yield dynamic_cloud(image, depth, mask, intrinsics, world_T_cam[frame], config, lens)
 
 
 def dynamic_cloud(
@@ -89,10 +93,11 @@ def dynamic_cloud(
     intrinsics: FloatArray,
     world_T_cam: FloatArray,
     config: FusionConfig,
+    lens: Lens = PINHOLE,
 ) -> Cloud:
     """Return the cloud of the moving instances of one frame; depth edges are left out."""
     keep = (mask > 0) & ~depth_edges(depth, config.edge_relative_gradient)
-    return lift(image, depth, keep, intrinsics, world_T_cam, config.dynamic_stride)
+    return lift(image, depth, keep, intrinsics, world_T_cam, config.dynamic_stride, lens)
 
 
 def lift(
@@ -102,14 +107,17 @@ def lift(
     intrinsics: FloatArray,
     world_T_cam: FloatArray,
     stride: int,
+    lens: Lens = PINHOLE,
 ) -> Cloud:
-    """Lift every ``stride``-th pixel (in x and y) that is kept and has depth into the world."""
+    """Lift every ``stride``-th pixel (in x and y) that is kept, has depth and a direction, into the world."""
     chosen = np.zeros(depth.shape, dtype=bool)
     chosen[::stride, ::stride] = True
     with np.errstate(invalid="ignore"):
         chosen &= keep & np.isfinite(depth) & (depth > 0.0)
     v, u = np.nonzero(chosen)
-    uv = np.stack((u, v), axis=-1).astype(np.float64)
+    uv = lens.ideal_pixels(intrinsics, np.stack((u, v), axis=-1).astype(np.float64))
+    seen = np.isfinite(uv).all(axis=1)
+    u, v, uv = u[seen], v[seen], uv[seen]
     points = camera_to_world(world_T_cam, unproject(intrinsics, uv, depth[v, u].astype(np.float64)))
     return Cloud(points, image[v, u])
 

@@ -101,6 +101,7 @@ class RunClouds:
             self.run.reconstruction.intrinsics,
             self.run.reconstruction.world_T_cam,
             self.fusion.model_copy(update={"static_frame_stride": stride}),
+            lens=self.run.reconstruction.lens,
         )
         return ColoredPoints.of(*cloud, np.zeros(len(cloud.points), np.int32)).thinned(
             self.limits.static_points
@@ -125,7 +126,12 @@ class RunClouds:
                 return NOTHING
             mask, here = sequence.masks[frame], depth[frame]
             keep = (mask > 0) & ~depth_edges(here, self.fusion.edge_relative_gradient)
-            camera = reconstruction.intrinsics, reconstruction.world_T_cam[frame], self.fusion.dynamic_stride
+            camera = (
+                reconstruction.intrinsics,
+                reconstruction.world_T_cam[frame],
+                self.fusion.dynamic_stride,
+                reconstruction.lens,
+            )
             points, colors = lift(sequence.images[frame], here, keep, *camera)
             instance = lift(np.asarray(mask), here, keep, *camera).colors.astype(np.int32)
             return ColoredPoints.of(points, colors, instance)

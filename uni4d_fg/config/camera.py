@@ -1,0 +1,44 @@
+"""Configuration of the camera model."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+from pydantic import field_validator
+
+from uni4d_fg.config.base import Section, setting
+
+ModelChoice: TypeAlias = Literal["auto", "pinhole", "simple_radial", "radial", "opencv", "opencv_fisheye"]
+
+
+class CameraConfig(Section):
+    """The lens: given, or found with the cameras."""
+
+    model: ModelChoice = setting(
+        "auto",
+        "Camera model, by COLMAP's names; 'auto' starts at the pinhole and adds radial distortion where the images "
+        "ask for it.",
+        basic=True,
+    )
+    observations: int = setting(20000, "Observations that the lens is found from, at most.", ge=1000)
+    frames: int = setting(60, "Frames that the lens is found from, at most.", ge=3)
+    hold_out_every: int = setting(5, "Every so many tracks, one is held out to judge the models.", ge=2)
+    starts: tuple[float, ...] = setting((-0.3, -0.15, 0.15), "Distortions k1 from which the search starts.")
+    rounds: int = setting(2, "Joint solves; between them, outliers are judged anew.", ge=1)
+    relative_decrease: float = setting(
+        1e-7, "A joint solve stops when a step lowers the energy by less than this part.", gt=0, lt=1
+    )
+    parameter_prior_sigma: float = setting(0.5, "Sigma of the prior on every distortion parameter, about zero.", gt=0)
+    max_iterations: int = setting(100, "Linearizations of a joint solve, at most.", ge=1)
+    probe_steps: int = setting(2, "Undamped steps from which the evidence for distortion is read.", ge=1)
+    min_evidence: float = setting(
+        0.003, "Part of the reprojection energy that free distortion must take away to be taken.", ge=0, lt=1
+    )
+    min_displacement_px: float = setting(1.0, "Distance by which it must move some pixel of the image, px.", ge=0)
+
+    @field_validator("starts")
+    @classmethod
+    def _starts_are_few_and_small(cls, starts: tuple[float, ...]) -> tuple[float, ...]:
+        if not starts or any(not -1.0 < k1 < 1.0 for k1 in starts):
+            raise ValueError("needs at least one distortion, each between -1 and 1")
+        return starts

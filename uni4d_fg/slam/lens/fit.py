@@ -1,0 +1,263 @@
+"""Fitting one camera model: bundle adjustment with the lens as a variable, and the test on tracks it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.errors import DegenerateProblemError, SolverError
+from uni4d_fg.factors.camera_priors import fisheye_camera_prior, opencv_camera_prior
+from uni4d_fg.factors.factor_type import FactorType
+from uni4d_fg.factors.lens_reprojection import fisheye_reprojection, opencv_reprojection
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable import VariableType
+from uni4d_fg.factors.variable_types import FISHEYE_CAMERA, INTRINSICS, LANDMARK, LOG_SCALE, OPENCV_CAMERA, POSE
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
+from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import Stage, StageRunner
+from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.slam.lens.tracks import ideal_tracks, ideal_weight
+from uni4d_fg.slam.stages.bundle_adjustment import (
+    Freedom,
+    bundle_adjustment_problem,
+    structure_problem,
+    without_camera_motion,
+)
+from uni4d_fg.slam.stages.energy import MAP
+from uni4d_fg.slam.stages.lifting import lift, mean_per_row
+from uni4d_fg.slam.stages.observations import observations_of
+from uni4d_fg.slam.stages.scene import Cameras, StaticScene
+from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
+
+_FAR = 50.0
+"""Whitened error, squared and summed in a logarithm, beyond which a held-out observation counts as lost."""
+
+
+@dataclass(frozen=True)
+class FittedLens:
+    """The end of one fit."""
+
+    lens: Lens
+    scene: StaticScene
+    """Of part of the tracks, on ideal pixels of the lens."""
+    evidence: float = 0.0
+    """Part of the reprojection energy that was lost when the model's parameters were set free."""
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(4,) px."""
+        return self.scene.cameras.intrinsics
+
+
+def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
+    """Return the configuration of stages 1 and 2 for fits: cameras only, E_cam only between consecutive frames."""
+    stage = config.bundle_adjustment.model_copy(update={"structure": "keep", "covariance_cells": 0})
+    return config.model_copy(update={"bundle_adjustment": stage if consecutive else without_camera_motion(stage)})
+
+
+@dataclass
+class LensFit:
+    """Fits camera models to the same tracks.
+
+    Stage 1 and 2 run on ideal pixels, with the lens found so far, for cameras, landmarks and the outlier rules; then a
+    joint solve moves everything, the lens included, on real pixels.
+    """
+
+    config: Config
+    """See :func:`settings_of_fit`."""
+    tracks: LabelledTracks
+    """On real pixels."""
+    prior_intrinsics: FloatArray
+    """(4,) the sequence's own."""
+    run: StageRunner
+    hooks: Hooks | None = None
+    solves: list[SolveSummary] = field(default_factory=list)
+
+    def scene(self, lens: Lens, intrinsics: FloatArray) -> StaticScene:
+        """Run stages 1 and 2 with a lens that is undone beforehand.
+
+        Raises:
+            DegenerateProblemError: If the cues do not determine the cameras.
+            SolverError: If a system is singular or a cue is not finite.
+        """
+        solver = StaticSceneSolver(self.config, self.run, self.hooks)
+        ideal = ideal_tracks(self.tracks, intrinsics, lens)
+        found = solver.solve(ideal, intrinsics, self.prior_intrinsics, free_intrinsics=True)
+        self.solves += found.solves
+        return found
+
+    def search(self, starts: tuple[float, ...]) -> FittedLens:
+        """Return the best of several k1, each undone before stages 1 and 2 run from the given intrinsics.
+
+        Raises:
+            DegenerateProblemError: If no start gives cameras.
+        """
+        fits = []
+        for k1 in starts:
+            lens = Lens("SIMPLE_RADIAL", (k1,))
+            try:
+                fits.append(FittedLens(lens, self.scene(lens, self.prior_intrinsics)))
+            except (DegenerateProblemError, SolverError):
+                continue
+        if not fits:
+            raise DegenerateProblemError("the lens: no start of the search gives cameras; give the camera model")
+        return min(fits, key=self.energy_per_track)
+
+    def energy_per_track(self, fit: FittedLens) -> float:
+        """Return the robust reprojection energy of a fit on real pixels, dropped observations counted as lost."""
+        seen = fit.scene.observations
+        _, row = seen.rows()
+        error = _errors(self.tracks, seen.track, seen.frame, fit, fit.scene.landmarks[row])
+        sigma = self.config.bundle_adjustment.reprojection_sigma_px
+        kept = np.log1p(np.minimum(error / sigma, _FAR) ** 2).sum()
+        lost = int((self.tracks.weight > 0).sum()) - len(seen)
+        return float(kept + lost * np.log1p(_FAR**2)) / max(len(self.tracks.label), 1)
+
+    def refine(self, start: StaticScene, lens: Lens, model: LensModel, rounds: int = 1) -> FittedLens:
+        """Solve everything together; between rounds stages 1 and 2 judge outliers anew.
+
+        Args:
+            start: A scene on ideal pixels of ``lens``.
+            lens: Its lens, of the same family.
+            model: The model whose parameters are set free.
+            rounds: Joint solves.
+
+        Raises:
+            DegenerateProblemError: If the cues do not determine the cameras.
+            SolverError: If a system is singular or a cue is not finite.
+        """
+        fit = self._joint(start, lens, model)
+        for _ in range(1, rounds):
+            fit = replace(self._joint(self.scene(fit.lens, fit.intrinsics), fit.lens, model), evidence=fit.evidence)
+        return fit
+
+    def probe(self, scene: StaticScene) -> float:
+        """Return the evidence for one radial parameter at a pinhole's minimum, from a few steps without damping.
+
+        The valley between focal length and distortion is narrow, but close to quadratic: an undamped step crosses it,
+        where a solve to the end would creep along it.
+        """
+        steps = {"max_iterations": self.config.camera.probe_steps, "initial_damping": 1e-9}
+        return self._joint(scene, Lens(), "SIMPLE_RADIAL", steps).evidence
+
+    def _joint(
+        self, scene: StaticScene, lens: Lens, model: LensModel, options: Mapping[str, float] | None = None
+    ) -> FittedLens:
+        """Solve with the parameters held, and then free: what the second gains is the evidence for them."""
+        variable, reprojection, prior = _family(model)
+        camera_config, ba = self.config.camera, self.config.bundle_adjustment
+        problem, state = self._problem(scene, lens, variable, reprojection, prior)
+        until_the_end = {
+            "relative_decrease": camera_config.relative_decrease,
+            "max_iterations": camera_config.max_iterations,
+        }
+        solver = ba.solver.model_copy(update=dict(options or until_the_end))
+        pixel = [] if ba.free_principal_point else [2, 3]
+        held = Stage("lens", replace(problem).fix(variable, entries=[*pixel, 4, 5, 6, 7]), solver, part="held")
+        state, before = self.run(held, state, self.hooks)
+        unused = range(4 + len(PARAMETERS[model]), 8)
+        free = Stage("lens", replace(problem).fix(variable, entries=[*pixel, *unused]), solver, part=model)
+        state, after = self.run(free, state, self.hooks)
+        self.solves += [before, after]
+        camera = state[variable][0]
+        cameras = Cameras(state[POSE], camera[:4], state[LOG_SCALE][:, 0])
+        moved = replace(scene, cameras=cameras, landmarks=state[LANDMARK])
+        gain = before.final_energy - after.final_energy
+        evidence = gain / max(before.final_energies["static_reprojection"], 1e-300)
+        return FittedLens(Lens.of(model, camera[4:]), moved, evidence)
+
+    def _problem(
+        self, scene: StaticScene, lens: Lens, variable: VariableType, reprojection: FactorType, prior: FactorType
+    ) -> tuple[Problem, State]:
+        """Return bundle adjustment of a scene with the reprojection through a lens in place of the pinhole's."""
+        ba, seen, pinhole = self.config.bundle_adjustment, scene.observations, scene.state()
+        camera = np.concatenate([scene.cameras.intrinsics, lens.padded])[None]
+        arrays = {v: array for v, array in pinhole.arrays.items() if v is not INTRINSICS}
+        state = State({variable: camera, **arrays}, pinhole.index)
+        others = bundle_adjustment_problem(
+            pinhole, seen, scene.noise, ba, self.prior_intrinsics[None],
+            Freedom(poses=True, intrinsics=False),
+        )  # fmt: skip
+        problem = Problem.over(state).eliminate(LANDMARK).fix(POSE, rows=[0])
+        problem.add(batch for batch in others.batches if all(s.variable is not INTRINSICS for s in batch.slots))
+        _, row = seen.rows()
+        real = self.tracks.tracks.uv[seen.track, seen.frame].astype(np.float64)
+        # Those of stage 2, drift included, without what ideal pixels lose.
+        weight = seen.weight / ideal_weight(lens, scene.cameras.intrinsics, seen.uv)
+        sigma = scene.noise.reprojection_sigma_px
+        noise = MAP.observed(sigma, weight, ba.reprojection_kernel, seen.frame, len(state[POSE]))
+        problem.add(reprojection(seen.frame, row, 0, uv=real, **noise))
+        fx, fy = self.prior_intrinsics[:2]
+        wide = np.concatenate(
+            [
+                ba.focal_prior_fraction * np.array([fx, fy, fx, fy]),
+                np.full(4, self.config.camera.parameter_prior_sigma),
+                [ba.aspect_prior_sigma],
+            ]
+        )
+        center = np.concatenate([self.prior_intrinsics, np.zeros(4)])
+        return problem.add(prior([0], measured=center[None], log_aspect=[np.log(fx / fy)], sigma=wide[None])), state
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Tracks that no model was fitted to."""
+
+    config: Config
+    tracks: LabelledTracks
+    """On real pixels."""
+    run: StageRunner
+    hooks: Hooks | None = None
+
+    def gain(self, fit: FittedLens, other: FittedLens) -> float:
+        """Return the part by which a fit explains the tracks better than another: of the median track's energy."""
+        ours, theirs = self.energies(fit), self.energies(other)
+        both = np.isfinite(ours) & np.isfinite(theirs)
+        if not both.any():
+            return 0.0
+        return float(np.median(theirs[both] - ours[both]) / np.median(theirs[both]))
+
+    def energies(self, fit: FittedLens) -> FloatArray:
+        """Triangulate the tracks under frozen cameras; return each one's robust energy per observation, NaN if lost."""
+        cameras, ba = fit.scene.cameras, self.config.bundle_adjustment
+        seen = observations_of(
+            ideal_tracks(self.tracks, cameras.intrinsics, fit.lens), TrackLabel.STATIC, TrackLabel.SHORT_STATIC
+        ).with_min_observations(3)
+        tracks, row = seen.rows()
+        landmarks = mean_per_row(lift(seen, cameras), seen.weight, row, len(tracks))
+        known = np.isfinite(landmarks).all(axis=1)
+        seen = seen.select(known[row])
+        tracks, row = seen.rows()
+        out = np.full(len(self.tracks.label), np.nan)
+        if not len(tracks):
+            return out
+        state = cameras.state(landmarks[known], tracks)
+        problem = structure_problem(state, seen, fit.scene.noise, ba).fix(LOG_SCALE)
+        state, _ = self.run(Stage("structure", problem, ba.structure_solver, part="held out"), state, self.hooks)
+        error = _errors(self.tracks, seen.track, seen.frame, fit, state[LANDMARK][row])
+        energy = np.log1p(np.minimum(error / ba.reprojection_sigma_px, _FAR) ** 2)
+        out[tracks] = np.bincount(row, energy) / np.bincount(row)
+        return out
+
+
+def _family(model: LensModel) -> tuple[VariableType, FactorType, FactorType]:
+    """Return the variable of a model's family, its reprojection and its prior."""
+    if model == "OPENCV_FISHEYE":
+        return FISHEYE_CAMERA, fisheye_reprojection, fisheye_camera_prior
+    return OPENCV_CAMERA, opencv_reprojection, opencv_camera_prior
+
+
+def _errors(
+    tracks: LabelledTracks, track: np.ndarray, frame: np.ndarray, fit: FittedLens, points: FloatArray
+) -> FloatArray:
+    """Return the distance, px, of real pixels of observations (N,) from where points (N, 3) appear."""
+    x = world_to_camera(fit.scene.cameras.world_T_cam[frame], points)
+    real = fit.lens.real_pixels(fit.intrinsics, np.asarray(project(fit.intrinsics, x)))
+    return np.asarray(np.linalg.norm(real - tracks.tracks.uv[track, frame], axis=1))
