@@ -18,7 +18,8 @@ it is linear.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -58,8 +59,8 @@ def to_gtsam(
         for item in gtsam_factors(batch, state, native=native, stacked=stacked):
             graph.push_back(item)
     read = variables_read(problem, state)
-    for item in _holding_priors(problem, state, read):
-        graph.push_back(item)
+    for variable, held in held_variables(problem, state, read):
+        graph.push_back(held.prior(variable))
     return graph, state.to_values(read)
 
 
@@ -78,15 +79,34 @@ def gtsam_factors(batch: FactorBatch, state: State, *, native: bool = True, stac
     """Yield a batch as GTSAM factors; rows of weight zero are left out."""
     if not (batch.weight > 0).all():
         batch = batch.take(np.flatnonzero(batch.weight > 0))
-    if len(batch) == 0:
-        return
+    if native and (made := _native_factors(batch, state)):
+        yield from (item for item in made if item is not None)
+        batch = batch.take(np.array([row for row, item in enumerate(made) if item is None], dtype=np.int64))
+    if len(batch):
+        yield from StackedFactors(batch, state, stacked).factors()
+
+
+def row_factors(batch: FactorBatch, state: State) -> list[Any]:
+    """Return one factor per row (n,), GTSAM's own where it equals ours; the rows have weights above zero."""
+    made = _native_factors(batch, state) or [None] * len(batch)
+    left = np.array([row for row, item in enumerate(made) if item is None], dtype=np.int64)
+    if len(left):
+        for row, item in zip(left.tolist(), StackedFactors(batch.take(left), state, False).factors(), strict=True):
+            made[row] = item
+    return made
+
+
+def _native_factors(batch: FactorBatch, state: State) -> list[Any]:
+    """Return GTSAM's own factor per row, None where it has none that is equal; nothing where it never has."""
     make = batch.factor_type.native
-    if make is not None and native and batch.kernel.kind in _NATIVE_KERNELS:
-        keys = [state.keys(slot.variable) for slot in batch.slots]
-        left = []
-        for row in range(len(batch)):
-            places = [int(slot.rows[row]) for slot in batch.slots]
-            item = make(
+    if make is None or batch.kernel.kind not in _NATIVE_KERNELS:
+        return []
+    keys = [state.keys(slot.variable) for slot in batch.slots]
+    made = []
+    for row in range(len(batch)):
+        places = [int(slot.rows[row]) for slot in batch.slots]
+        made.append(
+            make(
                 NativeRow(
                     tuple(of_slot[place] for of_slot, place in zip(keys, places, strict=True)),
                     tuple(state[s.variable][place] for s, place in zip(batch.slots, places, strict=True)),
@@ -95,13 +115,8 @@ def gtsam_factors(batch: FactorBatch, state: State, *, native: bool = True, stac
                     batch.kernel.kind != "quadratic",
                 )
             )
-            if item is None:
-                left.append(row)
-            else:
-                yield item
-        batch = batch.take(np.array(left, dtype=np.int64))
-    if len(batch):
-        yield from StackedFactors(batch, state, stacked).factors()
+        )
+    return made
 
 
 class StackedFactors:
@@ -235,8 +250,29 @@ def _robust_square_root(
     return (root_weight * a)[:, None] * white, out
 
 
-def _holding_priors(problem: Problem, state: State, read: dict[VariableType, Any]) -> Iterator[Any]:
-    """Yield priors on the entries that are frozen, and on those of GTSAM's tangents that ours do not have (skew)."""
+@dataclass(frozen=True)
+class Held:
+    """A variable of which some entries are frozen."""
+
+    key: int
+    value: FloatArray
+    sigma: FloatArray
+    """Of its prior, in GTSAM's tangent."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing of it may move."""
+        return bool((self.sigma == HELD_SIGMA).all())
+
+    def prior(self, variable: VariableType) -> Any:
+        """Return the prior that holds it."""
+        return _prior(self.key, variable.to_gtsam(self.value), gtsam.noiseModel.Diagonal.Sigmas(self.sigma))
+
+
+def held_variables(
+    problem: Problem, state: State, read: Mapping[VariableType, Any]
+) -> Iterator[tuple[VariableType, Held]]:
+    """Yield what is frozen, and what of GTSAM's tangents ours do not have (skew), among the rows that are read."""
     for variable, rows in read.items():
         free = problem.free.get(variable)
         width = variable.gtsam_dim or variable.dim
@@ -248,10 +284,8 @@ def _holding_priors(problem: Problem, state: State, read: dict[VariableType, Any
             sigma = np.full(width, HELD_SIGMA)
             if free is not None:
                 sigma[columns] = np.where(free[row], _LOOSE_SIGMA, HELD_SIGMA)
-            if (sigma == _LOOSE_SIGMA).all():
-                continue
-            noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
-            yield _prior(key, variable.to_gtsam(state[variable][row]), noise)
+            if not (sigma == _LOOSE_SIGMA).all():
+                yield variable, Held(key, state[variable][row], sigma)
 
 
 def _prior(key: int, value: Any, noise: Any) -> Any:
