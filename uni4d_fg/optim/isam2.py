@@ -4,7 +4,7 @@ Kaess et al. (2012), "iSAM2: Incremental Smoothing and Mapping Using the Bayes T
 before: factors that are new join the Bayes tree, those that are gone leave it, and only what they touch is linearized
 and eliminated again. Nothing is marginalized: memory and the cost of a large change grow with all that was ever added.
 
-A factor is the same one if its type, its variables and its measurements are; its noise may drift by a few per cent
+A factor is the same one if its type, its variables and its measurements are; its information may drift by a fifth
 before it is replaced. Every row is a factor of its own, since one that stacks rows would have to be replaced with every
 observation.
 """
@@ -29,8 +29,8 @@ from uni4d_fg.optim.summary import IterationRecord, SolveSummary, Termination
 
 Signature: TypeAlias = tuple[Any, ...]
 
-_NOISE_CHANGE = 0.05
-"""Relative change of a factor's sigma or weight at which it is replaced."""
+_NOISE_CHANGE = 0.2
+"""Relative change of a factor's information at which it is replaced."""
 _MOVED = 1e-9
 """Distance at which a held variable that somebody else has moved is held anew."""
 
