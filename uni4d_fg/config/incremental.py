@@ -20,9 +20,8 @@ class IncrementalConfig(Section):
         60, "'isam2' ends with an error at more keyframes than this: it marginalizes none.", ge=2
     )
     isam2_relinearize_threshold: float = setting(
-        1e-4, "'isam2' linearizes variables anew whose step is above this, in the units of each.", gt=0
+        1e-3, "'isam2' linearizes variables anew whose step is above this, in the units of each.", gt=0
     )
-    isam2_max_updates: int = setting(5, "Largest number of updates of 'isam2' per keyframe.", ge=1)
     window: int = setting(
         12, "Keyframes in the window; the oldest is marginalized when it is full.", ge=3, le=200, basic=True
     )

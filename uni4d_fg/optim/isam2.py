@@ -51,8 +51,6 @@ class Isam2Runner:
 
     relinearize_threshold: float = 1e-4
     """Entries of a step above this linearize their variable anew."""
-    max_updates: int = 5
-    """Updates of the tree per solve; fewer once nothing is linearized anew."""
     tree: gtsam.ISAM2 = field(init=False)
     _in_tree: dict[Signature, _InTree] = field(init=False, default_factory=dict)
 
@@ -62,6 +60,8 @@ class Isam2Runner:
     def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
         """Bring the tree to what a stage says and return the estimate.
 
+        The tree is updated until the energy falls by less than the stage's ``relative_decrease``, or
+        ``max_iterations`` times.
         If the tree's estimate has a higher energy than ``state``, it is built anew from there.
 
         Raises:
@@ -70,16 +70,16 @@ class Isam2Runner:
         began = time.perf_counter()
         initial = stage.problem.energies(state)
         notes: dict[str, Any] = {"backend": "gtsam"}
-        found, records = self._solved(stage, state, began, again=False)
+        found, records, settled = self._solved(stage, state, began, again=False)
         if found is None or stage.problem.energy(found) > sum(initial.values()):
             notes["rebuilt"] = True
             self._plant()
-            found, records = self._solved(stage, state, began, again=True)
+            found, records, settled = self._solved(stage, state, began, again=True)
         assert found is not None
         final, termination = stage.problem.energies(found), Termination.RELATIVE_DECREASE
         if sum(final.values()) > sum(initial.values()):
             found, final, termination = state, initial, Termination.DAMPING_LIMIT
-        elif len(records) == self.max_updates:
+        elif not settled:
             termination = Termination.MAX_ITERATIONS
         terms = tuple(dict.fromkeys(batch.name for batch in stage.problem.batches))
         notes["solved_by"] = [{"by": "GTSAM ISAM2", "terms": terms, "why": "smoother isam2"}]
@@ -96,8 +96,9 @@ class Isam2Runner:
 
     def _solved(
         self, stage: Stage, state: State, began: float, again: bool
-    ) -> tuple[State | None, list[IterationRecord]]:
-        """Return the estimate, None if the system was singular and may be tried again, and one record per update."""
+    ) -> tuple[State | None, list[IterationRecord], bool]:
+        """Return the estimate, None if the system was singular and may be tried again; the updates; if they settled."""
+        solver = stage.solver
         graph, values, gone, signatures = self._changes(stage, state)
         records: list[IterationRecord] = []
         try:
@@ -109,14 +110,15 @@ class Isam2Runner:
                 found = unfrozen(stage.problem, state, found)
                 energy = stage.problem.energy(found)
                 records.append(IterationRecord(energy, time.perf_counter() - began, 0.0, 0, 0))
-                if len(records) == self.max_updates or result.getVariablesRelinearized() == 0 and len(records) > 1:
-                    return found, records
-                result = self.tree.update()
+                settled = len(records) > 1 and energy > (1.0 - solver.relative_decrease) * records[-2].energy
+                if settled or len(records) == solver.max_iterations:
+                    return found, records, settled
+                self.tree.update()
         except RuntimeError as error:
             if again:
                 line = str(error).strip().split("\n", 1)[0]
                 raise SolverError(f"{stage.name}: GTSAM ISAM2 failed: {line}") from error
-            return None, []
+            return None, [], False
 
     def _changes(
         self, stage: Stage, state: State
