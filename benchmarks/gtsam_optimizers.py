@@ -1,6 +1,7 @@
 """Do GTSAM's optimizers and ours agree, stage by stage, and what does an iteration cost?
 
-    python benchmarks/gtsam_optimizers.py [SEQUENCE] [--frames 12] [--step 1] [--grid 26 20] [--tables agreement end cost]
+    python benchmarks/gtsam_optimizers.py [SEQUENCE] [--frames 12] [--step 1] [--grid 26 20] [--repeats 5]
+                                          [--tables agreement end cost]
 
 Without a sequence on a synthetic scene of 12 frames. The sequence is reconstructed with the preset 'default', and each
 stage's problem is taken from the run folder. Printed as Markdown:
@@ -111,8 +112,11 @@ def print_agreement(stages: dict[str, StageGraph], config: Config, truth: FloatA
     """Print how the solvers agree."""
     for label, changes in (("the stage's own tolerances", {}), ("converged", CONVERGED)):
         print(f"\n### Agreement, {label}\n")
-        print("| stage | solver | iterations | ms / iteration | time, s | energy | relative to the first | rotation, deg "
-              "| position, mm | focal, px | ATE, mm |\n|" + "---|" * 11)  # fmt: skip
+        heads = (
+            "stage", "solver", "iterations", "ms / iteration", "time, s", "energy", "relative to the first",
+            "rotation, deg", "position, mm", "focal, px", "ATE, mm",
+        )  # fmt: skip
+        print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads))
         for kind, stage in stages.items():
             first: tuple[State, float] | None = None
             for name, (backend, optimizer) in SOLVERS.items():
@@ -130,7 +134,7 @@ def print_agreement(stages: dict[str, StageGraph], config: Config, truth: FloatA
 
 
 def lowered(stage: StageGraph) -> tuple[float, int]:
-    """Return by what part GTSAM's Levenberg-Marquardt lowers the energy of a stage's end, and in how many iterations."""
+    """Return by what part GTSAM's Levenberg-Marquardt lowers the energy of a stage's end, and its iterations."""
     solver = SolverConfig(optimizer="gtsam_levenberg_marquardt", relative_decrease=1e-9, max_iterations=100)
     _, summary = LevenbergMarquardtRunner(choose_backend("python"))(
         Stage(stage.kind, stage.problem, solver), stage.final_state

@@ -192,7 +192,6 @@ def test_what_cannot_be_solved_says_so(rng: np.random.Generator) -> None:
         minimize_with_gtsam(broken, state, tight("gtsam_dogleg"))
 
 
-
 @pytest.mark.parametrize("make", [bundle_adjustment, camera_init], ids=["landmarks", "pairs"])
 def test_rows_evaluated_together_are_those_evaluated_alone(
     rng: np.random.Generator, make: Callable[[np.random.Generator], tuple[Problem, State]]

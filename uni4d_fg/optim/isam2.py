@@ -171,10 +171,11 @@ def _signatures(batch: FactorBatch, state: State, seen: set[Signature]) -> list[
     """Return what every row is known by, and add it to ``seen``; equal factors are counted."""
     keys = [state.keys(slot.variable) for slot in batch.slots]
     columns = [[k[row] for row in slot.rows.tolist()] for k, slot in zip(keys, batch.slots, strict=True)]
-    data = np.concatenate([np.zeros((len(batch), 0)), *(a.reshape(len(batch), -1) for a in batch.data.values())], axis=1)
+    count = len(batch)
+    data = np.concatenate([np.zeros((count, 0)), *(a.reshape(count, -1) for a in batch.data.values())], axis=1)
     kernel = (batch.kernel.kind, batch.kernel.threshold)
     out = []
-    for row in range(len(batch)):
+    for row in range(count):
         signature: Signature = (batch.name, kernel, *(column[row] for column in columns), data[row].tobytes())
         while signature in seen:
             signature = (*signature, "again")

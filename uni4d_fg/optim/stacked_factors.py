@@ -118,9 +118,7 @@ class StackedFactors:
         count, d = r.shape
         row, entry = np.arange(count)[:, None, None], np.arange(d)[:, None]
         first = 0
-        for variable, rows, begin, columns in zip(
-            self._variables, self._rows, self._begin, self._columns, strict=True
-        ):
+        for variable, rows, begin, columns in zip(self._variables, self._rows, self._begin, self._columns, strict=True):
             mine = rows[begin[index] : begin[index + 1]]
             stacked = np.zeros((len(mine), count, d, variable.gtsam_dim or variable.dim))
             for slot, block in zip(self.batch.slots, point.blocks, strict=True):
@@ -144,9 +142,7 @@ class StackedFactors:
             found = point.arrays
             if all(
                 np.array_equal(found[variable][rows[begin[index] : begin[index + 1]]], mine)
-                for variable, rows, begin, mine in zip(
-                    self._variables, self._rows, self._begin, current, strict=True
-                )
+                for variable, rows, begin, mine in zip(self._variables, self._rows, self._begin, current, strict=True)
             ):
                 return point
         base = self.state.arrays if point is None else point.arrays
