@@ -98,5 +98,5 @@ def test_factors_that_go_or_change(made: tuple[Problem, State]) -> None:
 def test_a_singular_system_is_named(made: tuple[Problem, State]) -> None:
     problem, state = made
     alone = Problem((problem.batches[0].take(np.arange(1)),), problem.free)
-    with pytest.raises(SolverError, match="GTSAM ISAM2 failed"):
+    with pytest.raises(SolverError, match=r"GTSAM ISAM2 failed: .* near variable \w+[ \w]*, \w+ \d"):
         Isam2Runner()(Stage("bundle_adjustment", alone, CONFIG), state)

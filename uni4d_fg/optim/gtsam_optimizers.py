@@ -18,6 +18,7 @@ A custom factor costs a copy of all values per callback here: small problems onl
 from __future__ import annotations
 
 import math
+import re
 import time
 from typing import Any, Literal
 
@@ -28,6 +29,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import SolverError
 from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable import describe
 from uni4d_fg.optim.gtsam_graph import to_gtsam, variables_read
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.objective import SolvedPart
@@ -84,7 +86,9 @@ def minimize_with_gtsam(
     if sum(final.values()) > sum(initial.values()):
         found, final, records = state, initial, []
     seconds = {"total": time.perf_counter() - began}
-    notes = {} if native else {"gtsam_factors": "custom: a point went behind a camera, where GTSAM's own cost nothing"}
+    notes = {"backend": "gtsam"}
+    if not native:
+        notes["gtsam_factors"] = "custom: a point went behind a camera, where GTSAM's own cost nothing"
     return found, SolveSummary(name, termination, initial, final, tuple(records), seconds, notes=notes)
 
 
@@ -145,7 +149,9 @@ class _Solve:
             try:
                 optimizer.iterate()
             except RuntimeError as error:
-                raise SolverError(f"{self.name}: {NAMES[_chosen(self.config)]} failed: {_message(error)}") from error
+                raise SolverError(
+                    f"{self.name}: {NAMES[_chosen(self.config)]} failed: {gtsam_message(error)}"
+                ) from error
             after, damping = float(optimizer.error()), self._damping()
             if not after < energy:
                 termination = self._gave_up(damping)
@@ -197,6 +203,8 @@ def _chosen(config: SolverConfig) -> GtsamOptimizer:
     return config.optimizer
 
 
-def _message(error: RuntimeError) -> str:
-    """Return the first line of what GTSAM says, keys in words."""
-    return str(error).strip().split("\n", 1)[0]
+def gtsam_message(error: RuntimeError) -> str:
+    """Return what GTSAM says in one line, without its advice, and with the variable in words."""
+    text = str(error).strip().split("\n\n", 1)[0].split("Thrown when", 1)[0]
+    named = re.sub(r"(\d{15,}) \(Symbol: [^)]*\)", lambda found: describe(int(found[1])), text)
+    return " ".join(named.split())

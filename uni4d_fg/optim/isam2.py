@@ -22,7 +22,7 @@ from uni4d_fg.errors import SolverError
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.state import State
 from uni4d_fg.optim.gtsam_graph import Held, held_variables, row_factors, variables_read
-from uni4d_fg.optim.gtsam_optimizers import unfrozen
+from uni4d_fg.optim.gtsam_optimizers import gtsam_message, unfrozen
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage
 from uni4d_fg.optim.summary import IterationRecord, SolveSummary, Termination
@@ -119,8 +119,7 @@ class Isam2Runner:
                 self.tree.update()
         except RuntimeError as error:
             if again:
-                line = str(error).strip().split("\n", 1)[0]
-                raise SolverError(f"{stage.name}: GTSAM ISAM2 failed: {line}") from error
+                raise SolverError(f"{stage.name}: GTSAM ISAM2 failed: {gtsam_message(error)}") from error
             return None, [], False
 
     def _changes(

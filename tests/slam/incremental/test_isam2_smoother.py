@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stream_samples import ate, feed, stream, stream_config, true_poses
+from stream_samples import ate, feed, stream, stream_config, tracks_of, true_poses
 
 from uni4d_fg.errors import ConfigError, SolverError
-from uni4d_fg.slam.incremental import FrameStatus
+from uni4d_fg.pipeline.stream_checkpoint import restore, state_arrays
+from uni4d_fg.slam.incremental import FrameStatus, IncrementalReconstructor
 
 SCENE = {"grid_columns": 9, "grid_rows": 7}
 EVERY_FRAME = ("incremental.keyframe_parallax=0", "nonrigid.arap_weight=0")
@@ -38,6 +39,19 @@ def test_older_frames_still_count() -> None:
         assert updates[-1].window == (6 if smoother == "window" else 10)
         errors[smoother] = ate(solver.finish().world_T_cam, true_poses(sequence))
     assert errors["isam2"] < 1.1 * errors["window"]
+
+
+def test_a_resumed_stream_grows_its_tree_anew() -> None:
+    sequence, config = stream(10, **SCENE), stream_config(*EVERY_FRAME, "incremental.smoother=isam2")
+    whole, _ = feed(sequence, config, frames=list(range(7)))
+    first, _ = feed(sequence, config, frames=list(range(6)))
+    again = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config)
+    restore(again, state_arrays(first))
+    again.add_frame(
+        sequence.images[6], sequence.depths[6], sequence.masks[6], tracks_of(sequence, 6), sequence.timestamps[6]
+    )
+    distance = np.linalg.norm(again.window.pose[:, :3, 3] - whole.window.pose[:, :3, 3], axis=1)
+    assert distance.max() < 1e-3
 
 
 def test_too_many_keyframes_are_refused() -> None:
