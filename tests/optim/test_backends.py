@@ -25,10 +25,11 @@ CONVERGED = [
     for stage in ("camera_init", "bundle_adjustment", "nonrigid")
     for setting in ("relative_decrease=1e-9", "max_iterations=300")
 ]
-"""Solves that end at the minimum: GTSAM damps differently, so that early stops end in different places."""
-ENERGY_TOLERANCE = {"cpp": 1e-8, "gtsam": 1e-3}
-CENTRE_TOLERANCE_M = {"cpp": 1e-7, "gtsam": 1e-3}
-INTRINSICS_TOLERANCE = {"cpp": 1e-7, "gtsam": 2e-3}
+"""Solves that end at the minimum: the backends reach it on different ways, so that early stops end elsewhere."""
+ENERGY_TOLERANCE = {"cpp": 1e-8, "gtsam": 1e-4}
+"""On another way a landmark may end in another minimum of its depth kernel."""
+CENTRE_TOLERANCE_M = {"cpp": 1e-7, "gtsam": 1e-7}
+INTRINSICS_TOLERANCE = {"cpp": 1e-7, "gtsam": 1e-7}
 
 needs_extension = pytest.mark.skipif(find_extension()[0] is None, reason=find_extension()[1] or "installed")
 

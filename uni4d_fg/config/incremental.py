@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.solver import SolverConfig
 
@@ -9,6 +11,17 @@ from uni4d_fg.config.solver import SolverConfig
 class IncrementalConfig(Section):
     """Windowed solving of a video of any length. Terms, kernels and sigmas are those of stages 2 and 3."""
 
+    smoother: Literal["window", "isam2"] = setting(
+        "window",
+        "Solver of the cameras. 'window': the newest keyframes, older ones marginalized; 'isam2': GTSAM's ISAM2 over "
+        "all keyframes, for small problems: its memory is not bounded.",
+    )
+    isam2_max_keyframes: int = setting(
+        60, "'isam2' ends with an error at more keyframes than this: it marginalizes none.", ge=2
+    )
+    isam2_relinearize_threshold: float = setting(
+        1e-3, "'isam2' linearizes variables anew whose step is above this, in the units of each.", gt=0
+    )
     window: int = setting(
         12, "Keyframes in the window; the oldest is marginalized when it is full.", ge=3, le=200, basic=True
     )

@@ -8,8 +8,13 @@ from uni4d_fg.config.base import Section, setting
 
 
 class SolverConfig(Section):
-    """Options of one Levenberg-Marquardt solve."""
+    """Options of one solve."""
 
+    optimizer: Literal["levenberg_marquardt", "gtsam_levenberg_marquardt", "gtsam_dogleg"] = setting(
+        "levenberg_marquardt",
+        "What minimizes: this package's loop on the chosen backend, or one of GTSAM's optimizers on the stage's "
+        "factor graph, which are slow: for small problems and for comparison.",
+    )
     max_iterations: int = setting(50, "Largest number of linearizations.", ge=1, basic=True)
     relative_decrease: float = setting(
         1e-5, "Stop when an accepted step lowers the energy by less than this part.", gt=0, lt=1

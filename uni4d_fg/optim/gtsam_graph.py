@@ -18,21 +18,23 @@ it is linear.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.factor_type import NativeRow
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stacked_factors import StackedFactors
 
-HELD_SIGMA = 1e-6
-"""Sigma of a frozen entry, in the entry's unit."""
+HELD_SIGMA = 1e-8
+"""Sigma of a frozen entry, in the entry's unit: a gradient g there moves it by g 1e-16 and saves half of g^2 1e-16."""
 _LOOSE_SIGMA = 1e9
 """Sigma of an entry that a prior leaves alone."""
 _NATIVE_KERNELS = ("quadratic", "huber", "cauchy")
@@ -58,8 +60,8 @@ def to_gtsam(
         for item in gtsam_factors(batch, state, native=native, stacked=stacked):
             graph.push_back(item)
     read = variables_read(problem, state)
-    for item in _holding_priors(problem, state, read):
-        graph.push_back(item)
+    for variable, held in held_variables(problem, state, read):
+        graph.push_back(held.prior(variable))
     return graph, state.to_values(read)
 
 
@@ -78,15 +80,34 @@ def gtsam_factors(batch: FactorBatch, state: State, *, native: bool = True, stac
     """Yield a batch as GTSAM factors; rows of weight zero are left out."""
     if not (batch.weight > 0).all():
         batch = batch.take(np.flatnonzero(batch.weight > 0))
-    if len(batch) == 0:
-        return
+    if native and (made := _native_factors(batch, state)):
+        yield from (item for item in made if item is not None)
+        batch = batch.take(np.array([row for row, item in enumerate(made) if item is None], dtype=np.int64))
+    if len(batch):
+        yield from StackedFactors(batch, state, stacked).factors()
+
+
+def row_factors(batch: FactorBatch, state: State) -> list[Any]:
+    """Return one factor per row (n,), GTSAM's own where it equals ours; the rows have weights above zero."""
+    made = _native_factors(batch, state) or [None] * len(batch)
+    left = np.array([row for row, item in enumerate(made) if item is None], dtype=np.int64)
+    if len(left):
+        for row, item in zip(left.tolist(), StackedFactors(batch.take(left), state, False).factors(), strict=True):
+            made[row] = item
+    return made
+
+
+def _native_factors(batch: FactorBatch, state: State) -> list[Any]:
+    """Return GTSAM's own factor per row, None where it has none that is equal; nothing where it never has."""
     make = batch.factor_type.native
-    if make is not None and native and batch.kernel.kind in _NATIVE_KERNELS:
-        keys = [state.keys(slot.variable) for slot in batch.slots]
-        left = []
-        for row in range(len(batch)):
-            places = [int(slot.rows[row]) for slot in batch.slots]
-            item = make(
+    if make is None or batch.kernel.kind not in _NATIVE_KERNELS:
+        return []
+    keys = [state.keys(slot.variable) for slot in batch.slots]
+    made = []
+    for row in range(len(batch)):
+        places = [int(slot.rows[row]) for slot in batch.slots]
+        made.append(
+            make(
                 NativeRow(
                     tuple(of_slot[place] for of_slot, place in zip(keys, places, strict=True)),
                     tuple(state[s.variable][place] for s, place in zip(batch.slots, places, strict=True)),
@@ -95,148 +116,33 @@ def gtsam_factors(batch: FactorBatch, state: State, *, native: bool = True, stac
                     batch.kernel.kind != "quadratic",
                 )
             )
-            if item is None:
-                left.append(row)
-            else:
-                yield item
-        batch = batch.take(np.array(left, dtype=np.int64))
-    if len(batch):
-        yield from StackedFactors(batch, state, stacked).factors()
+        )
+    return made
 
 
-class StackedFactors:
-    """The rows of a batch as custom factors, several rows to a factor.
+@dataclass(frozen=True)
+class Held:
+    """A variable of which some entries are frozen."""
 
-    Making a factor is a slice and a call; what its callback needs is worked out when it is called.
-    """
+    key: int
+    value: FloatArray
+    sigma: FloatArray
+    """Of its prior, in GTSAM's tangent."""
 
-    def __init__(self, batch: FactorBatch, state: State, stacked: bool = True):
-        """Sort the rows by what they are stacked by.
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing of it may move."""
+        return bool((self.sigma == HELD_SIGMA).all())
 
-        Args:
-            batch: All rows.
-            state: The numbers of the keys.
-            stacked: Whether to stack as the factor type says; one row per factor when False.
-        """
-        count, slots = len(batch), batch.factor_type.stack
-        stack: IntArray = np.arange(count)
-        if stacked and slots is not None:
-            chosen = (slots,) if isinstance(slots, int) else slots
-            numbers = np.stack([state.numbers(batch.slots[i].variable)[batch.slots[i].rows, 0] for i in chosen])
-            if (np.diff(numbers, axis=1) < 0).any():
-                order = np.lexsort(numbers[::-1])
-                batch, numbers = batch.take(order), numbers[:, order]
-            stack = np.concatenate([[0], np.cumsum((np.diff(numbers, axis=1) != 0).any(axis=0))])
-        self.state, self.batch = state, batch
-        self._count = int(stack[-1]) + 1
-        self._start: list[int] = np.searchsorted(stack, np.arange(self._count + 1)).tolist()
-        self._variables = list(dict.fromkeys(slot.variable for slot in batch.slots))
-        # Per variable type the distinct rows of every stack, one after another, and where each stack's begin.
-        self._rows: list[IntArray] = []
-        self._begin: list[list[int]] = []
-        for variable in self._variables:
-            rows, begin = self._distinct([s.rows for s in batch.slots if s.variable is variable], stack)
-            self._rows.append(rows)
-            self._begin.append(begin)
-
-    def _distinct(self, slots: list[IntArray], stack: IntArray) -> tuple[IntArray, list[int]]:
-        """Return the distinct rows of every stack, ascending, and where each stack's begin."""
-        first = slots[0]
-        if len(slots) == 1 and (first == first[0]).all():  # one variable that all share
-            return np.full(self._count, first[0]), list(range(self._count + 1))
-        if len(slots) == 1 and self._count < len(stack):
-            inside = np.diff(stack) == 0
-            if (np.diff(first)[inside] == 0).all():  # the variable that the stacks are made by
-                return first[np.array(self._start[:-1])], list(range(self._count + 1))
-            if (np.diff(first)[inside] > 0).all():
-                return first, self._start
-        size = max(int(rows.max()) for rows in slots) + 1
-        pairs = np.unique(np.concatenate([stack * size + rows for rows in slots]))
-        begin: list[int] = np.searchsorted(pairs // size, np.arange(self._count + 1)).tolist()
-        return pairs % size, begin
-
-    def factors(self) -> Iterator[gtsam.CustomFactor]:
-        """Yield the factors."""
-        dim = self.batch.factor_type.dim
-        keys = [
-            np.array(self.state.keys(variable), dtype=np.uint64)[rows].tolist()
-            for variable, rows in zip(self._variables, self._rows, strict=True)
-        ]
-        noise: dict[int, Any] = {}
-        for i in range(self._count):
-            size = dim * (self._start[i + 1] - self._start[i])
-            if size not in noise:
-                noise[size] = gtsam.noiseModel.Unit.Create(size)
-            own: list[int] = []
-            for k, b in zip(keys, self._begin, strict=True):
-                own += k[b[i] : b[i + 1]]
-            yield gtsam.CustomFactor(noise[size], own, _Callback(self, i))
-
-    def error(self, index: int, keys: list[int], values: gtsam.Values, jacobians: Any) -> FloatArray:
-        """Return the stacked whitened residual of a factor and write its Jacobians."""
-        batch = self.batch.take(np.arange(self._start[index], self._start[index + 1]))
-        rows_of, offset_of, first = {}, {}, 0
-        for variable, rows, begin in zip(self._variables, self._rows, self._begin, strict=True):
-            rows_of[variable] = rows[begin[index] : begin[index + 1]]
-            offset_of[variable] = first
-            first += len(rows_of[variable])
-        current = {
-            variable: np.stack([variable.from_gtsam(values, key) for key in keys[offset_of[variable] :][: len(rows)]])
-            for variable, rows in rows_of.items()
-        }
-        place = [np.searchsorted(rows_of[slot.variable], slot.rows) for slot in batch.slots]
-        arguments = [current[slot.variable][at] for slot, at in zip(batch.slots, place, strict=True)]
-        if jacobians is None:
-            r, _ = _robust_square_root(batch, np.asarray(batch.factor_type.residual(*arguments, **batch.data)), [])
-            return r.reshape(-1)
-        r, blocks = batch.factor_type.linearize(*arguments, **batch.data)
-        batch.check(r, blocks, self.state)  # GTSAM would accept a wrong shape and a NaN
-        r, blocks = _robust_square_root(batch, r, blocks)
-        count, d = r.shape
-        for variable, rows in rows_of.items():
-            width = variable.gtsam_dim or variable.dim
-            columns = list(variable.gtsam_columns) or list(range(variable.dim))
-            stacked = np.zeros((len(rows), count, d, width))
-            for slot, at, block in zip(batch.slots, place, blocks, strict=True):
-                if slot.variable is variable:
-                    for n, row in enumerate(at.tolist()):  # a variable may stand in two slots of one factor: add
-                        stacked[row, n][:, columns] += block[n]
-            for i in range(len(rows)):
-                jacobians[offset_of[variable] + i] = np.asfortranarray(stacked[i].reshape(count * d, width))
-        return r.reshape(-1)
+    def prior(self, variable: VariableType) -> Any:
+        """Return the prior that holds it."""
+        return _prior(self.key, variable.to_gtsam(self.value), gtsam.noiseModel.Diagonal.Sigmas(self.sigma))
 
 
-class _Callback:
-    """What GTSAM calls for one stacked factor."""
-
-    __slots__ = ("index", "owner")
-
-    def __init__(self, owner: StackedFactors, index: int):
-        self.owner, self.index = owner, index
-
-    def __call__(self, this: Any, values: gtsam.Values, jacobians: Any) -> FloatArray:
-        return self.owner.error(self.index, list(this.keys()), values, jacobians)
-
-
-def _robust_square_root(
-    batch: FactorBatch, r: FloatArray, blocks: list[FloatArray]
-) -> tuple[FloatArray, list[FloatArray]]:
-    """Return a(s) r and its exact Jacobians, with |a r|^2 / 2 = weight rho(s)."""
-    inverse_sigma = 1.0 / (batch.sigma[:, None] if batch.sigma.ndim == 1 else batch.sigma)
-    white = r * inverse_sigma
-    a, slope = batch.kernel.square_root(np.einsum("nd,nd->n", white, white))
-    root_weight = np.sqrt(batch.weight)
-    out = []
-    for block in blocks:
-        white_block = block * inverse_sigma[:, :, None]
-        radial = np.einsum("nd,ndk->nk", white, white_block)
-        full = a[:, None, None] * white_block + (slope[:, None] * white)[:, :, None] * radial[:, None, :]
-        out.append(root_weight[:, None, None] * full)
-    return (root_weight * a)[:, None] * white, out
-
-
-def _holding_priors(problem: Problem, state: State, read: dict[VariableType, Any]) -> Iterator[Any]:
-    """Yield priors on the entries that are frozen, and on those of GTSAM's tangents that ours do not have (skew)."""
+def held_variables(
+    problem: Problem, state: State, read: Mapping[VariableType, Any]
+) -> Iterator[tuple[VariableType, Held]]:
+    """Yield what is frozen, and what of GTSAM's tangents ours do not have (skew), among the rows that are read."""
     for variable, rows in read.items():
         free = problem.free.get(variable)
         width = variable.gtsam_dim or variable.dim
@@ -248,10 +154,8 @@ def _holding_priors(problem: Problem, state: State, read: dict[VariableType, Any
             sigma = np.full(width, HELD_SIGMA)
             if free is not None:
                 sigma[columns] = np.where(free[row], _LOOSE_SIGMA, HELD_SIGMA)
-            if (sigma == _LOOSE_SIGMA).all():
-                continue
-            noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
-            yield _prior(key, variable.to_gtsam(state[variable][row]), noise)
+            if not (sigma == _LOOSE_SIGMA).all():
+                yield variable, Held(key, state[variable][row], sigma)
 
 
 def _prior(key: int, value: Any, noise: Any) -> Any:

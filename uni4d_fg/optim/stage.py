@@ -12,7 +12,7 @@ from uni4d_fg.factors.kernels import Kernel
 from uni4d_fg.factors.state import State
 from uni4d_fg.optim.backend import Backend, Planned, choose_backend, make_objective
 from uni4d_fg.optim.levenberg_marquardt import Hooks, minimize
-from uni4d_fg.optim.objective import Reweightable
+from uni4d_fg.optim.objective import Reweightable, SolvedPart
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.summary import IterationRecord, SolveSummary, Termination
 
@@ -107,10 +107,21 @@ class _Rounds:
         self.stage, self.backend = stage, backend
         self._planned: Planned | None = None
 
-    def plan(self, step: Round, state: State, solver: SolverConfig) -> Planned:
-        """Return what a round minimises."""
-        full = self.stage.problem
+    def solve(
+        self, step: Round, state: State, solver: SolverConfig, hooks: Hooks | None
+    ) -> tuple[State, SolveSummary, list[SolvedPart]]:
+        """Solve a round; also return what solved which terms."""
+        full, name = self.stage.problem, self.stage.name
         problem = replace(full, batches=tuple(step.apply(batch) for batch in full.batches))
+        if solver.optimizer != "levenberg_marquardt":
+            from uni4d_fg.optim.gtsam_optimizers import gtsam_parts, minimize_with_gtsam
+
+            return *minimize_with_gtsam(problem, state, solver, name=name, hooks=hooks), gtsam_parts(problem, solver)
+        planned = self._plan(problem, state, solver)
+        return *minimize(planned.objective, state, solver, name=name, hooks=hooks), planned.parts()
+
+    def _plan(self, problem: Problem, state: State, solver: SolverConfig) -> Planned:
+        """Return what a round minimises."""
         if self._planned is not None and isinstance(self._planned.objective, Reweightable):
             self._planned.objective.reweight(problem)
         else:
@@ -129,15 +140,16 @@ def _run_schedule(
     solved_by: list[dict[str, Any]] = []
     for step in schedule:
         solver = stage.solver if step is schedule[-1] else _early(stage.solver)
-        planned = rounds.plan(step, state, solver)
-        state, summary = minimize(planned.objective, state, solver, name=stage.name, hooks=hooks)
+        state, summary, by = rounds.solve(step, state, solver, hooks)
         parts.append(summary)
-        solved_by = [asdict(part) for part in planned.parts()]
+        solved_by = [asdict(part) for part in by]
         if summary.termination is Termination.CANCELLED:
             break
     initial = parts[0].initial_energies if exact[0] else initial
     final = parts[-1].final_energies if exact[len(parts) - 1] else problem.energies(state)
     notes: dict[str, Any] = {"backend": backend.name, "solved_by": solved_by}
+    for part in parts:
+        notes |= part.notes
     if len(parts) > 1:
         notes["rounds"] = len(parts)
     iterations, seconds = _succession(parts)

@@ -28,6 +28,7 @@ from uni4d_fg.slam.incremental.model import (
 )
 from uni4d_fg.slam.incremental.pose import FramePose, composed_covariance, locate, predict
 from uni4d_fg.slam.incremental.results import Results, ResultsInMemory, assemble_results
+from uni4d_fg.slam.incremental.smoother import make_smoother
 from uni4d_fg.slam.incremental.tracking import OnlineTracker
 from uni4d_fg.slam.incremental.window import CameraWindow, LeftLandmarks
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -94,6 +95,7 @@ class IncrementalReconstructor:
         self.last_timestamp = -np.inf
         self.last_pose = np.eye(4)
         self._run = LevenbergMarquardtRunner(choose_backend(config.backend))
+        self.smoother = make_smoother(incremental, self._run)
         self._seconds: dict[str, float] = {}
 
     @property
@@ -148,10 +150,10 @@ class IncrementalReconstructor:
         left: list[tuple[int, FloatArray, FloatArray, float]] = []
         if status is not FrameStatus.TRACKED:
             with self._timed("window"):
-                self.window.solve(self._run)
+                self.smoother.solve(self.window)
             with self._timed("covariance"):
                 self.window.update_covariance()
-            while len(self.window) > self.config.incremental.window:
+            while self.smoother.must_slide(self.window):
                 with self._timed("marginalize"):
                     oldest, gone = self.window.slide()
                 left.append((oldest.frame, oldest.world_T_cam, oldest.covariance, oldest.log_scale))
