@@ -39,6 +39,9 @@ def export(
     depth: Annotated[bool, typer.Option("--depth", help="colmap, nerfstudio: dense depth too.")] = False,
     text: Annotated[bool, typer.Option(help="colmap: the model as text too.")] = True,
     trajectories: Annotated[bool, typer.Option("--trajectories", help="ply: trajectories, camera path too.")] = False,
+    undistort: Annotated[
+        bool, typer.Option("--undistort", help="Frames, masks and depth without lens distortion, with a pinhole.")
+    ] = False,
     trail: Annotated[int, typer.Option(help="rrd: past frames that a trajectory shows.", min=1)] = 10,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
@@ -53,7 +56,9 @@ def export(
         stored = stored_input(run)
         return (stored if sequence is None else replace(stored, root=str(sequence.resolve()))).read()
 
-    choices = ExportOptions(masks=masks, depth=depth, text=text, trajectories=trajectories, trail=trail)
+    choices = ExportOptions(
+        masks=masks, depth=depth, text=text, trajectories=trajectories, trail=trail, undistort=undistort
+    )
     with progress_reporter(quiet or json) as reporter, Interruption() as stop:
         reports = export_run(
             Run(run, open_sequence), [choice.value for choice in to], out, choices,

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
+from uni4d_fg.geometry.lens import Lens
 
-PINHOLE = 1
-"""Number of the camera model with fx, fy, cx, cy."""
+CAMERA_MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+"""COLMAP's numbers of the models with fx, fy, cx, cy, of which the last two have four parameters more."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class ColmapModel:
     """(height, width), px."""
     intrinsics: FloatArray
     """(4,) fx, fy, cx, cy, px."""
+    lens: Lens
     names: list[str]
     """T file names."""
     quaternions: FloatArray
@@ -62,11 +64,23 @@ class ColmapModel:
         return np.asarray(np.searchsorted(self.point, np.arange(len(self.points) + 1)))
 
 
+def camera_parameters(model: ColmapModel) -> tuple[str, FloatArray]:
+    """Return COLMAP's name of the camera model, and its numbers.
+
+    SIMPLE_RADIAL and RADIAL have one focal length in COLMAP; with two, they are written as OPENCV.
+    """
+    if model.lens.is_pinhole:
+        return "PINHOLE", model.intrinsics
+    name = "OPENCV_FISHEYE" if model.lens.is_fisheye else "OPENCV"
+    return name, np.concatenate([model.intrinsics, model.lens.padded])
+
+
 def write_binary(model: ColmapModel, folder: Path) -> None:
     """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``; the folder must exist. Raises OSError."""
     height, width = model.image_size
-    camera = struct.pack("<QiiQQ4d", 1, 1, PINHOLE, width, height, *model.intrinsics.tolist())
-    (folder / "cameras.bin").write_bytes(camera)
+    name, parameters = camera_parameters(model)
+    camera = struct.pack("<QiiQQ", 1, 1, CAMERA_MODELS[name], width, height)
+    (folder / "cameras.bin").write_bytes(camera + struct.pack(f"<{len(parameters)}d", *parameters.tolist()))
     record = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
     with open(folder / "images.bin", "wb") as stream:
         stream.write(struct.pack("<Q", len(model.names)))
@@ -91,8 +105,9 @@ def write_text(model: ColmapModel, folder: Path) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; the folder must exist. Raises OSError."""
     height, width = model.image_size
     with open(folder / "cameras.txt", "w", encoding="utf-8") as stream:
-        stream.write("# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy\n")
-        stream.write(f"1 PINHOLE {width} {height} {_numbers(model.intrinsics)}\n")
+        name, parameters = camera_parameters(model)
+        stream.write("# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy, then the distortion\n")
+        stream.write(f"1 {name} {width} {height} {_numbers(parameters)}\n")
     with open(folder / "images.txt", "w", encoding="utf-8") as stream:
         stream.write("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of X, Y, POINT3D_ID\n")
         for row, seen in enumerate(model.of_image()):

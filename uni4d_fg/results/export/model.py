@@ -23,6 +23,8 @@ class ExportOptions:
     """colmap: write the model as text beside the binary one."""
     trajectories: bool = False
     """ply: write the trajectories of moving points and the camera path as line sets."""
+    undistort: bool = False
+    """Write frames, masks, depth and observations as a pinhole would see them; formats without lenses always do."""
     trail: int = 10
     """rrd: frames of the past that a trajectory shows."""
 
@@ -73,5 +75,7 @@ class Exporter:
     """Write everything into the job's folder, and note facts."""
     needs_images: bool = False
     """The frames of the sequence must be readable."""
+    has_lens: bool = False
+    """Whether the format can say how the images are distorted, or has no images."""
     require: Callable[[], object] = lambda: None
     """Raise MissingDependencyError if a package is missing; called before anything is written."""

@@ -55,9 +55,11 @@ def write_nerfstudio(job: ExportJob) -> None:
         meta["depth_unit_scale_factor"] = 0.001
     fx, fy, cx, cy = result.intrinsics.tolist()
     height, width = result.image_size
+    names_of_lens = ("k1", "k2", "k3", "k4") if result.lens.is_fisheye else ("k1", "k2", "p1", "p2")
     camera = {
-        "camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "w": width, "h": height,
-        "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+        "camera_model": "OPENCV_FISHEYE" if result.lens.is_fisheye else "OPENCV",
+        "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "w": width, "h": height,
+        **dict(zip(names_of_lens, result.lens.padded.tolist(), strict=True)),
     }  # fmt: skip
     atomic_write_json(
         job.folder / "transforms.json", camera | meta | {"ply_file_path": "sparse_pc.ply", "frames": frames}

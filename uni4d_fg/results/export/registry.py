@@ -13,11 +13,11 @@ from uni4d_fg.results.export.trajectories import write_kitti_folder, write_tum_f
 from uni4d_fg.results.export.uni4d import write_uni4d_results
 
 FORMATS: dict[str, Exporter] = {
-    "colmap": Exporter(write_colmap, needs_images=True),
-    "nerfstudio": Exporter(write_nerfstudio, needs_images=True, require=import_open3d),
-    "tum": Exporter(write_tum_folder),
-    "kitti": Exporter(write_kitti_folder),
-    "ply": Exporter(write_ply_folder, require=import_open3d),
+    "colmap": Exporter(write_colmap, needs_images=True, has_lens=True),
+    "nerfstudio": Exporter(write_nerfstudio, needs_images=True, has_lens=True, require=import_open3d),
+    "tum": Exporter(write_tum_folder, has_lens=True),
+    "kitti": Exporter(write_kitti_folder, has_lens=True),
+    "ply": Exporter(write_ply_folder, has_lens=True, require=import_open3d),
     "rrd": Exporter(write_rrd, needs_images=True, require=import_rerun),
     "uni4d": Exporter(write_uni4d_results, needs_images=True, require=import_open3d),
 }

@@ -15,6 +15,7 @@ from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.results.export.model import ExportJob, ExportOptions, ExportReport
 from uni4d_fg.results.export.registry import exporter
 from uni4d_fg.results.run import Run
+from uni4d_fg.results.undistort import undistorted
 
 MARKER = "export.json"
 """In the folder of every export; says what made it, and that it may be replaced."""
@@ -74,8 +75,12 @@ def _export(
 ) -> ExportReport:
     reporter.begin(name, run.num_frames)
     with _replaced_folder(target) as folder:
-        job = ExportJob(run, folder, options, reporter, should_stop)
-        exporter(name).write(job)
+        chosen = exporter(name)
+        straight = not run.reconstruction.lens.is_pinhole and (options.undistort or not chosen.has_lens)
+        job = ExportJob(undistorted(run) if straight else run, folder, options, reporter, should_stop)
+        if straight:
+            job.facts.append(f"undistorted: {run.reconstruction.lens.model} to PINHOLE")
+        chosen.write(job)
         facts = {"format": name, "run": str(run.folder.root.resolve()), "figures": job.figures, "facts": job.facts}
         atomic_write_json(folder / MARKER, facts)
     reporter.end()
