@@ -10,7 +10,9 @@
 | ``OBJECT_POSE`` | o(instance, frame) | (4, 4) ``world_T_object`` | 6: body-frame (omega [rad], v [m]) |
 | ``OBJECT_POINT`` | q(track) | (3,) in the object's frame, m | 3 |
 | ``VELOCITY`` | v(frame) | (3,) of the camera, world axes, m/s | 3 |
-| ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s] | 6 |
+| ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s], camera axes | 6 |
+| ``GRAVITY`` | g(0) | (3,) acceleration of gravity, world axes, m/s^2 | 3 |
+| ``COMMON_LOG_SCALE`` | c(0) | (1,) what the log-scales of all frames have in common | 1 |
 """
 
 from __future__ import annotations
@@ -72,3 +74,5 @@ IMU_BIAS = VariableType(
     "imu_bias", "b", vector_space(6), label="IMU bias",
     to_gtsam=lambda value: gtsam.imuBias.ConstantBias(value[:3], value[3:]), from_gtsam=_at_bias,
 )  # fmt: skip
+GRAVITY = point_variable("gravity", "g", ("",))
+COMMON_LOG_SCALE = VariableType("common_log_scale", "c", vector_space(1), ("",), "common depth log-scale")

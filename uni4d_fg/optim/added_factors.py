@@ -21,6 +21,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.errors import SolverError
+from uni4d_fg.factors.factor_type import FactorType
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.optim.levenberg_marquardt import Hooks
@@ -43,6 +44,8 @@ class Addition:
     """Numbers of their keys; row numbers where a type is absent."""
     free: Mapping[VariableType, BoolArray] = field(default_factory=dict)
     """Free entries (n, dim) of types whose freedom shall be other than the stage's own."""
+    replaces: Sequence[FactorType] = ()
+    """Terms of the stage's own that these factors take the place of."""
     is_metric: bool = True
     """Whether the factors know lengths: the mean of the depth cue then no longer sets the scale of the world."""
 
@@ -70,7 +73,9 @@ class AddingRunner:
         if not additions:
             return self.run(stage, state, hooks)
         joined, added = self._joined(additions, state)
-        problem = replace(stage.problem)
+        replaced = {kind for addition in additions for kind in addition.replaces}
+        own = tuple(batch for batch in stage.problem.batches if batch.factor_type not in replaced)
+        problem = replace(stage.problem, batches=own)
         problem.free = {**problem.free, **{v: np.ones((len(joined[v]), v.dim), dtype=bool) for v in added}}
         for addition in additions:
             problem.add(*addition.factors, state=joined)
@@ -81,8 +86,8 @@ class AddingRunner:
         for variable in added:
             values = zip(map(tuple, joined.numbers(variable).tolist()), solved[variable], strict=True)
             self.known.setdefault(variable, {}).update(values)
-        own = {variable: array for variable, array in solved.arrays.items() if variable in state}
-        return State(own, state.index), summary
+        kept = {variable: array for variable, array in solved.arrays.items() if variable in state}
+        return State(kept, state.index), summary
 
     def _joined(self, additions: list[Addition], state: State) -> tuple[State, list[VariableType]]:
         arrays, index, added = dict(state.arrays), dict(state.index), []
