@@ -168,7 +168,7 @@ def adjust_bundle(
 
     Args:
         observations: Trusted observations of static tracks.
-        start: Starting cameras; their log-scales start at zero.
+        start: Starting cameras, with the log-scales that lift the depth cue.
         prior_intrinsics: (4,) the sequence's own intrinsics.
         config: Stage 2.
         freedom: Whether poses and intrinsics move.
@@ -181,7 +181,6 @@ def adjust_bundle(
         SolverError: If the system is singular or a cue is not finite.
     """
     dropped: dict[str, int] = {}
-    start = Cameras(start.world_T_cam, start.intrinsics, np.zeros(len(start.world_T_cam)))
     observations, landmarks = _liftable(observations, start, config, dropped)
     if len(observations) == 0:
         raise DegenerateProblemError(
