@@ -9,9 +9,9 @@ biases of 0.05 m/s^2 and 0.005 rad/s per axis that walk) is 7 cm from the camera
 the one without the IMU bridges the blackout by constant velocity.
 
 Columns: error of the scale, of a similarity that aligns all camera centers to the truth; root mean square error of the
-camera centers in the blackout and of those after it, cm, after an alignment on the frames before it (with the IMU a rigid one,
-without it a similarity); the ratio of the two in the blackout. The program fails if a scale is off by more than 1 % or a
-ratio is above a fifth.
+camera centers in the blackout and of those after it, cm, after an alignment on the frames before it (a rigid one with
+the IMU, a similarity without it); the ratio of the two in the blackout; seconds of both runs. The program fails if a
+scale is off by more than 1 % or a ratio is above a fifth.
 """
 
 from __future__ import annotations

@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.frontend.measurements.imu import NOISE_PRESETS, ImuNoise, ImuSamples
 
+MIN_POSES = 6
+"""Fewest poses that a path can be laid through."""
 WORLD_GRAVITY = np.array([0.0, 9.81, 0.0])
 """Of the synthetic room, whose y axis points down, m/s^2."""
 
@@ -41,7 +43,7 @@ class SmoothPath:
     """A smooth path through camera poses."""
 
     def __init__(self, timestamps: FloatArray, world_T_cam: FloatArray):
-        """Join poses (T, 4, 4) at times (T,) s; at least six."""
+        """Join poses (T, 4, 4) at times (T,) s; at least ``MIN_POSES``."""
         straight = [(3, np.zeros(3)), (4, np.zeros(3))]
         self._position: Any = make_interp_spline(timestamps, world_T_cam[:, :3, 3], k=5, bc_type=(straight, straight))
         self._rotation: Any = RotationSpline(timestamps, Rotation.from_matrix(world_T_cam[:, :3, :3]))
@@ -83,7 +85,7 @@ def simulate_imu(
 
     Args:
         timestamps: (T,) s of the frames.
-        world_T_cam: (T, 4, 4), T at least six.
+        world_T_cam: (T, 4, 4), T at least ``MIN_POSES``.
         seed: Seed of biases and noise.
         rate_hz: Samples per second.
         noise: Of the sensor; None for exact samples with a constant bias.

@@ -2,9 +2,9 @@
 
 Per pair of successive frames one ``gtsam.CombinedImuFactorWithGravityVector`` on both poses, velocities and biases and
 on gravity, whose direction is free and whose magnitude is known. With the first pose held, scale, velocities and
-gravity follow from the measurements. Two terms of the stage give way: the prior that centers the frames' log-scales at
-zero is centered at a value that they have in common and that is free (the cue may be of any scale), and the anchor of
-the scale, where there is one, is dropped.
+gravity follow from the measurements. Terms of the stage give way: the prior that centers the frames' log-scales at zero
+is centered at a value that they have in common and that is free (the cue may be of any scale); the anchor of the scale
+and the smoothness of the camera's motion are dropped, because the sensor knows better.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.imu import ImuConfig
 from uni4d_fg.factors.batch import FactorBatch
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
 from uni4d_fg.factors.factor_type import FactorType
 from uni4d_fg.factors.priors import gravity_magnitude, log_scale_about_common, log_scale_prior, scale_anchor
 from uni4d_fg.factors.state import State
@@ -63,7 +64,7 @@ class ImuSource:
                 IMU_BIAS: np.tile(self.start.bias, (len(self.start.velocity), 1)),
                 GRAVITY: self.start.gravity[None],
             }
-            replaced.append(scale_anchor)
+            replaced += [scale_anchor, camera_rotation, camera_translation]
         return Addition(factors, variables, replaces=replaced)
 
     def _inertial_factors(self) -> list[Any]:
