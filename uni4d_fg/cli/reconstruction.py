@@ -60,6 +60,8 @@ def reconstruct(
     """
     from uni4d_fg.config.load import load_config
     from uni4d_fg.frontend.measurements.imu import read_imu
+    from uni4d_fg.pipeline.inertial import check_goes_with_imu
+    from uni4d_fg.slam.windows.plan import windows_of
 
     chosen = [] if solver is None else [f"solver={solver.value}"]
     chosen += [] if window is None else [f"windows.frames={window}"]
@@ -74,6 +76,7 @@ def reconstruct(
     samples = None if imu is None else read_imu(imu)
     opened = source.open()
     if samples is not None:
+        check_goes_with_imu(settings, len(windows_of(settings, opened.video.num_frames)))
         samples.check_covers(opened.video.timestamps)
     plan = source.plan(opened)
     plan.check()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_RELATIVE
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.factors.variable_types import COMMON_LOG_SCALE, GRAVITY, IMU_BIAS
 from uni4d_fg.optim.added_factors import AddingRunner
@@ -28,6 +30,12 @@ def check_goes_with_imu(config: Config, num_windows: int) -> None:
     for reason, applies in reasons.items():
         if applies:
             raise ConfigError(f"inertial measurements do not go with {reason}; leave one of the two out")
+
+
+def metric_cues(cues: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is said of the cues of a video whose scale an IMU finds."""
+    warnings = [text for text in cues.get("warnings", []) if text not in (NOT_METRIC, NOT_METRIC_RELATIVE)]
+    return {**cues, "warnings": warnings, "metric": True}
 
 
 def imu_summary(start: InertialStart, runner: AddingRunner) -> dict[str, Any]:

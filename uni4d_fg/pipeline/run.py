@@ -31,7 +31,7 @@ from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import remove_graphs, write_graph_values
-from uni4d_fg.pipeline.inertial import check_goes_with_imu
+from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
@@ -151,6 +151,7 @@ def reconstruct(
     if imu is not None:
         check_goes_with_imu(config, len(windows))
         imu.check_covers(sequence.timestamps)
+        cues = None if cues is None else metric_cues(cues)
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
     summary = RunSummary(
@@ -182,7 +183,7 @@ def reconstruct(
     write_result(folder, reconstruction)
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
-    unit = "m" if imu is not None or summary.cues.get("metric", True) else "scale unknown"
+    unit = "m" if summary.cues.get("metric", True) else "scale unknown"
     write_views(folder, sequence, reconstruction, config, run.should_stop, unit=unit)
     graphs = write_graph_values(folder)
     run.reporter.end()

@@ -150,7 +150,8 @@ class _Sums:
             np.array([s.deltaRij().matrix() for s in sums]),
             position,
             velocity,
-            *by_bias,
+            by_bias[0],
+            by_bias[1],
             np.array([s.preintMeasCov()[3:9, 3:9] for s in sums]) + floor,
         )
 
