@@ -9,7 +9,7 @@ from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.factors.priors import log_scale_about_common, log_scale_prior
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import COMMON_LOG_SCALE, LOG_SCALE
-from uni4d_fg.optim.added_factors import HOLDS_SCALE, AddingRunner, Addition
+from uni4d_fg.optim.added_factors import HOLDS_SCALE, AddingRunner, Addition, as_solved
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 
@@ -56,3 +56,20 @@ def test_without_replacement_both_count() -> None:
     declared, state = stage()
     solved, _ = AddingRunner(run_stage, [lambda _, __: Addition(observed())])(declared, state)
     assert np.abs(solved[LOG_SCALE]).max() == pytest.approx(0.7 / 101.0, rel=1e-3)
+
+
+def test_a_stage_as_it_was_solved_has_what_every_source_added() -> None:
+    declared, state = stage()
+
+    def common(_: Stage, now: State) -> Addition:
+        factors = [log_scale_about_common([0, 1, 2], 0, sigma=0.05)]
+        return Addition(factors, {COMMON_LOG_SCALE: np.zeros((1, 1))}, replaces=[log_scale_prior])
+
+    inner = AddingRunner(run_stage, [lambda _, __: Addition(observed(), is_metric=False)])
+    runner = AddingRunner(inner, [common])
+    solved, _ = runner(declared, state)
+    whole, joined = as_solved(runner, declared, solved)
+    assert {batch.name for batch in whole.problem.batches} == {"log_scale_about_common", "log_scale_prior"}
+    np.testing.assert_allclose(joined[COMMON_LOG_SCALE], 0.6, atol=1e-6)
+    np.testing.assert_allclose(joined[LOG_SCALE], solved[LOG_SCALE])
+    assert as_solved(run_stage, declared, state) == (declared, state)

@@ -108,7 +108,7 @@ def align_with_imu(
     found = system.solve(config.camera_position_sigma_m)
     found = system.solve(max(system.position_noise(found), _MIN_POSITION_SIGMA))
     scale, sigma = found.scale, found.scale_sigma
-    if scale <= 0.0 or sigma > config.max_scale_sigma * scale:
+    if not (scale > 0.0 and sigma <= config.max_scale_sigma * scale):  # NaN too
         raise DegenerateProblemError(
             f"IMU: the scale comes out as {scale:.3g} +- {sigma:.2g}: accelerations of the camera and of the IMU do "
             "not agree, or there is too little of them. Check the units, axes and clock of the IMU (body_T_cam, "
