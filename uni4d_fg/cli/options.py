@@ -64,6 +64,13 @@ TrackModel = Annotated[
 IntrinsicsFile = Annotated[
     str | None, typer.Option("--intrinsics", help="Calibration: .npy of a (3, 3) matrix, px.", show_default=False)
 ]
+Imu = Annotated[
+    Path | None,
+    typer.Option(
+        "--imu", metavar="FILE|FOLDER", help="Accelerometer and gyroscope: a CSV file, or a folder with imu.csv.",
+        show_default=False,
+    ),
+]  # fmt: skip
 Start = Annotated[int, typer.Option(help="First frame.")]
 Stop = Annotated[int | None, typer.Option(help="First frame that is left out.", show_default=False)]
 Stride = Annotated[int, typer.Option(help="Take every so many frames.")]

@@ -19,6 +19,7 @@ from uni4d_fg.errors import Cancelled, ConfigError
 if TYPE_CHECKING:
     from uni4d_fg.config.models import Config
     from uni4d_fg.cues.plan import CuePlan, CueReport
+    from uni4d_fg.frontend.measurements.imu import ImuSamples
     from uni4d_fg.frontend.sequence.model import Sequence, Video
     from uni4d_fg.pipeline import RunSummary
 
@@ -45,6 +46,7 @@ def reconstruct(
     tracks: options.TrackFiles = None,
     track_model: options.TrackModel = None,
     intrinsics: options.IntrinsicsFile = None,
+    imu: options.Imu = None,
     layout: options.Layout = LayoutChoice.auto,
     depth_gt_scale: options.DepthScale = 1000.0,
     known_intrinsics: options.KnownIntrinsics = False,
@@ -57,6 +59,9 @@ def reconstruct(
     motion, tracks by a network or the built-in tracker.
     """
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.frontend.measurements.imu import read_imu
+    from uni4d_fg.pipeline.inertial import check_goes_with_imu
+    from uni4d_fg.slam.windows.plan import windows_of
 
     chosen = [] if solver is None else [f"solver={solver.value}"]
     chosen += [] if window is None else [f"windows.frames={window}"]
@@ -68,7 +73,11 @@ def reconstruct(
         mask_model=mask_model, classes=class_list(classes), track_model=track_model,
     )  # fmt: skip
     run = out or Path("runs") / (seq.stem if seq.is_file() else seq.resolve().name)
+    samples = None if imu is None else read_imu(imu)
     opened = source.open()
+    if samples is not None:
+        check_goes_with_imu(settings, len(windows_of(settings, opened.video.num_frames)))
+        samples.check_covers(opened.video.timestamps)
     plan = source.plan(opened)
     plan.check()
     prepare_run_folder(run, resume=resume, overwrite=overwrite)
@@ -76,7 +85,7 @@ def reconstruct(
     sequence, report = run_cues(opened.video, plan, run, settings, quiet=quiet)
     if report is not None and report.settings is not None:
         settings = report.settings
-    summary = run_pipeline(sequence, run, settings, resume=resume, quiet=quiet, cues=report)
+    summary = run_pipeline(sequence, run, settings, resume=resume, quiet=quiet, cues=report, imu=samples)
     if json:
         print_json(summary.to_dict())
     else:
@@ -148,8 +157,9 @@ def class_list(classes: str | None) -> tuple[str, ...] | None:
 
 
 def run_pipeline(
-    sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None
-) -> RunSummary:
+    sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None,
+    imu: ImuSamples | None = None,
+) -> RunSummary:  # fmt: skip
     """Reconstruct with progress; Ctrl-C ends the run cleanly and says how to go on.
 
     Raises:
@@ -161,7 +171,7 @@ def run_pipeline(
         try:
             return reconstruct_sequence(
                 sequence, run, config, resume=resume, reporter=reporter, should_stop=stop,
-                cues=None if cues is None else cues.to_dict(),
+                cues=None if cues is None else cues.to_dict(), imu=imu,
             )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"finished stages are kept in {run}; continue with: {resume_command()}") from error

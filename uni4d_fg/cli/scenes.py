@@ -11,8 +11,9 @@ import yaml
 
 from uni4d_fg.config.load import dump_config, with_overrides
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
-from uni4d_fg.errors import OutputError
+from uni4d_fg.errors import InputError, OutputError
 from uni4d_fg.files import atomic_write_text
+from uni4d_fg.frontend.measurements.imu import write_imu
 from uni4d_fg.frontend.sequence.model import Sequence as VideoSequence
 from uni4d_fg.frontend.sequence.write import write_native, write_uni4d
 
@@ -29,21 +30,32 @@ def scene_config(named: Mapping[str, Any], changes: Sequence[str]) -> SyntheticS
     return with_overrides(SyntheticSceneConfig(), [*given, *changes])
 
 
-def write_scene(scene: SyntheticSceneConfig, folder: Path, layout: str = "native") -> VideoSequence:
-    """Make a scene and write it, with its parameters in ``scene.yaml``.
+def write_scene(
+    scene: SyntheticSceneConfig, folder: Path, layout: str = "native", *, imu: bool = False
+) -> VideoSequence:
+    """Make a scene and write it, with its parameters in ``scene.yaml`` and, if wanted, the samples of an IMU.
 
     Raises:
+        InputError: If the video is too short for an IMU.
         OutputError: If the folder is in the way or cannot be written.
         MissingDependencyError: If Open3D cannot be loaded.
     """
+    from uni4d_fg.frontend.synthetic.imu import MIN_POSES, simulate_imu
     from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
 
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise OutputError(f"cannot write {folder}: it exists already; remove it or choose another folder")
+    if imu and scene.num_frames < MIN_POSES:
+        raise InputError(f"--imu: the path of an IMU needs {MIN_POSES} frames, got {scene.num_frames}")
     sequence = make_synthetic_sequence(scene)
+    samples = None
+    if imu and sequence.ground_truth.world_T_cam is not None:
+        samples = simulate_imu(sequence.timestamps, sequence.ground_truth.world_T_cam, seed=scene.seed).samples
     write = write_uni4d if layout == "uni4d" else write_native
     write(sequence, folder)
     atomic_write_text(folder / SCENE_FILE, dump_config(scene))
+    if samples is not None:
+        write_imu(samples, folder)
     return sequence
 
 

@@ -102,6 +102,7 @@ def synthesize(
     seed: Annotated[int | None, typer.Option(help="Seed of the noise.", show_default=False)] = None,
     changes: options.Overrides = None,
     layout: options.Layout = LayoutChoice.native,
+    imu: Annotated[bool, typer.Option("--imu", help="Write an accelerometer and a gyroscope too: imu.csv.")] = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Make a moving scene with exact ground truth. All fields of --set are in docs/configuration_advanced.md."""
@@ -111,7 +112,7 @@ def synthesize(
     scene = scene_config(named, changes or ())
     with progress_reporter(quiet) as reporter:
         reporter.begin("synthetic scene", None)
-        sequence = write_scene(scene, out, layout.value)
+        sequence = write_scene(scene, out, layout.value, imu=imu)
         reporter.end()
     tracks = 0 if sequence.tracks is None else sequence.tracks.num_tracks
     typer.echo(f"{sequence.num_frames} frames of {scene.width} x {scene.height} px, {tracks} tracks: {out}")

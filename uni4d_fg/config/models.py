@@ -12,6 +12,7 @@ from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.camera import CameraConfig
 from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
 from uni4d_fg.config.geometric_depth import AffineDepthConfig, GeometricDepthConfig
+from uni4d_fg.config.imu import ImuConfig
 from uni4d_fg.config.incremental import IncrementalConfig
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
@@ -63,6 +64,7 @@ class Config(Section):
     rigid_objects: RigidObjectsConfig = setting(
         RigidObjectsConfig(), "Search for moving instances that are rigid bodies, and their poses.", basic=True
     )
+    imu: ImuConfig = setting(ImuConfig(), "Inertial measurements in stage 2, where an IMU is given.", basic=True)
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
     windows: WindowsConfig = setting(WindowsConfig(), "Reconstruction in windows.", basic=True)
     incremental: IncrementalConfig = setting(

@@ -5,6 +5,8 @@ log-scale    r = s_t - s_0                              [dimensionless], 1-vecto
 aspect       r = log(fx / fy) - log(fx_0 / fy_0)        [dimensionless], 1-vector: the shape of a pixel
 scale        r = log(|c_a - c_b| / distance)            [dimensionless], 1-vector: fixes the scale of a
 reconstruction that no depth prior holds
+common       r = s_t - c                                [dimensionless], 1-vector: frames have one scale, of any size
+gravity      r = |g| - magnitude                        [m/s^2], 1-vector; no direction is preferred
 """
 
 from __future__ import annotations
@@ -16,7 +18,15 @@ import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
 from uni4d_fg.factors.factor_type import NativeRow, factor
-from uni4d_fg.factors.variable_types import CALIBRATION_COLUMNS, INTRINSICS, LOG_SCALE, POSE, calibration
+from uni4d_fg.factors.variable_types import (
+    CALIBRATION_COLUMNS,
+    COMMON_LOG_SCALE,
+    GRAVITY,
+    INTRINSICS,
+    LOG_SCALE,
+    POSE,
+    calibration,
+)
 
 _MIN_DISTANCE = 1e-9
 _LOOSE = 1e9
@@ -98,3 +108,30 @@ def aspect_prior_jacobian(intrinsics: FloatArray, *, measured: FloatArray) -> tu
     jacobian[:, 0, 0] = 1.0 / intrinsics[:, 0]
     jacobian[:, 0, 1] = -1.0 / intrinsics[:, 1]
     return aspect_prior.residual(intrinsics, measured=measured), [jacobian]
+
+
+@factor(LOG_SCALE, COMMON_LOG_SCALE, dim=1)
+def log_scale_about_common(log_scale: Array, common: Array) -> Array:
+    """Return log_scale - common, (N, 1)."""
+    return log_scale - common
+
+
+@log_scale_about_common.jacobian
+def log_scale_about_common_jacobian(log_scale: FloatArray, common: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the residual and the Jacobians of both, each (N, 1, 1)."""
+    one = np.ones((len(log_scale), 1, 1))
+    return log_scale - common, [one, -one]
+
+
+@factor(GRAVITY, data={"magnitude": ()}, dim=1)
+def gravity_magnitude(gravity: Array, *, magnitude: Array) -> Array:
+    """Return (N, 1) of gravity (N, 3) and its known magnitude (N,), m/s^2."""
+    xp = namespace(gravity)
+    return (xp.sqrt(xp.sum(gravity * gravity, axis=-1) + _MIN_DISTANCE**2) - magnitude)[..., None]
+
+
+@gravity_magnitude.jacobian
+def gravity_magnitude_jacobian(gravity: FloatArray, *, magnitude: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the residual and its Jacobian (N, 1, 3)."""
+    length = np.sqrt(np.sum(gravity * gravity, axis=-1) + _MIN_DISTANCE**2)
+    return (length - magnitude)[:, None], [(gravity / length[:, None])[:, None, :]]

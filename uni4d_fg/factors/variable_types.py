@@ -4,7 +4,7 @@
 |---|---|---|---|
 | ``POSE`` | x(frame) | (4, 4) ``world_T_cam`` | 6: body-frame (omega [rad], v [m]), ``T Exp(xi)`` |
 | ``INTRINSICS`` | k(camera) | (4,) fx, fy, cx, cy, px | 4 |
-| ``OPENCV_CAMERA`` | c(camera) | (8,) fx, fy, cx, cy, px, and k1, k2, p1, p2 | 8 |
+| ``OPENCV_CAMERA`` | d(camera) | (8,) fx, fy, cx, cy, px, and k1, k2, p1, p2 | 8 |
 | ``FISHEYE_CAMERA`` | f(camera) | (8,) fx, fy, cx, cy, px, and k1, k2, k3, k4 | 8 |
 | ``LOG_SCALE`` | s(frame) | (1,) log-scale of a frame's depth cue | 1 |
 | ``LANDMARK`` | l(track) | (3,) world, m | 3 |
@@ -12,7 +12,9 @@
 | ``OBJECT_POSE`` | o(instance, frame) | (4, 4) ``world_T_object`` | 6: body-frame (omega [rad], v [m]) |
 | ``OBJECT_POINT`` | q(track) | (3,) in the object's frame, m | 3 |
 | ``VELOCITY`` | v(frame) | (3,) of the camera, world axes, m/s | 3 |
-| ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s] | 6 |
+| ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s], camera axes | 6 |
+| ``GRAVITY`` | g(0) | (3,) acceleration of gravity, world axes, m/s^2 | 3 |
+| ``COMMON_LOG_SCALE`` | c(0) | (1,) what the log-scales of all frames have in common | 1 |
 """
 
 from __future__ import annotations
@@ -88,7 +90,7 @@ INTRINSICS = VariableType(
     to_gtsam=calibration, from_gtsam=_at_calibration, gtsam_columns=CALIBRATION_COLUMNS, gtsam_dim=5,
 )  # fmt: skip
 OPENCV_CAMERA = VariableType(
-    "opencv_camera", "c", vector_space(8), ("camera",), "camera with a lens",
+    "opencv_camera", "d", vector_space(8), ("camera",), "camera with a lens",
     to_gtsam=_opencv_camera, from_gtsam=_at_opencv_camera, gtsam_columns=LENS_COLUMNS, gtsam_dim=9,
 )  # fmt: skip
 FISHEYE_CAMERA = VariableType(
@@ -105,3 +107,5 @@ IMU_BIAS = VariableType(
     "imu_bias", "b", vector_space(6), label="IMU bias",
     to_gtsam=lambda value: gtsam.imuBias.ConstantBias(value[:3], value[3:]), from_gtsam=_at_bias,
 )  # fmt: skip
+GRAVITY = point_variable("gravity", "g", ("",))
+COMMON_LOG_SCALE = VariableType("common_log_scale", "c", vector_space(1), ("",), "common depth log-scale")

@@ -21,6 +21,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.errors import SolverError
+from uni4d_fg.factors.factor_type import FactorType
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.optim.levenberg_marquardt import Hooks
@@ -43,6 +44,8 @@ class Addition:
     """Numbers of their keys; row numbers where a type is absent."""
     free: Mapping[VariableType, BoolArray] = field(default_factory=dict)
     """Free entries (n, dim) of types whose freedom shall be other than the stage's own."""
+    replaces: Sequence[FactorType] = ()
+    """Terms of the stage's own that these factors take the place of."""
     is_metric: bool = True
     """Whether the factors know lengths: the mean of the depth cue then no longer sets the scale of the world."""
 
@@ -66,23 +69,39 @@ class AddingRunner:
 
     def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
         """Solve a stage with what the sources add."""
-        additions = [found for source in self.sources if (found := source(stage, state)) is not None]
+        additions = self._asked(stage, state)
         if not additions:
             return self.run(stage, state, hooks)
+        whole, joined = self._whole(additions, stage, state)
+        solved, summary = self.run(whole, joined, hooks)
+        if any(addition.is_metric for addition in additions):
+            summary = replace(summary, notes={**summary.notes, HOLDS_SCALE: True})
+        for variable in (v for v in joined.arrays if v not in state):
+            values = zip(map(tuple, joined.numbers(variable).tolist()), solved[variable], strict=True)
+            self.known.setdefault(variable, {}).update(values)
+        kept = {variable: array for variable, array in solved.arrays.items() if variable in state}
+        return State(kept, state.index), summary
+
+    def as_solved(self, stage: Stage, state: State) -> tuple[Stage, State]:
+        """Return a stage with what the sources add to it, and a state with the last values of what they add."""
+        additions = self._asked(stage, state)
+        if additions:
+            stage, state = self._whole(additions, stage, state)
+        return as_solved(self.run, stage, state)
+
+    def _asked(self, stage: Stage, state: State) -> list[Addition]:
+        return [found for source in self.sources if (found := source(stage, state)) is not None]
+
+    def _whole(self, additions: list[Addition], stage: Stage, state: State) -> tuple[Stage, State]:
         joined, added = self._joined(additions, state)
-        problem = replace(stage.problem)
+        replaced = {kind for addition in additions for kind in addition.replaces}
+        own = tuple(batch for batch in stage.problem.batches if batch.factor_type not in replaced)
+        problem = replace(stage.problem, batches=own)
         problem.free = {**problem.free, **{v: np.ones((len(joined[v]), v.dim), dtype=bool) for v in added}}
         for addition in additions:
             problem.add(*addition.factors, state=joined)
             problem.free = {**problem.free, **addition.free}
-        solved, summary = self.run(replace(stage, problem=problem), joined, hooks)
-        if any(addition.is_metric for addition in additions):
-            summary = replace(summary, notes={**summary.notes, HOLDS_SCALE: True})
-        for variable in added:
-            values = zip(map(tuple, joined.numbers(variable).tolist()), solved[variable], strict=True)
-            self.known.setdefault(variable, {}).update(values)
-        own = {variable: array for variable, array in solved.arrays.items() if variable in state}
-        return State(own, state.index), summary
+        return replace(stage, problem=problem), joined
 
     def _joined(self, additions: list[Addition], state: State) -> tuple[State, list[VariableType]]:
         arrays, index, added = dict(state.arrays), dict(state.index), []
@@ -107,3 +126,8 @@ class AddingRunner:
 def with_additions(run: StageRunner, sources: Sequence[FactorSource]) -> StageRunner:
     """Return a runner that adds what the sources say; the runner itself without sources."""
     return AddingRunner(run, sources) if sources else run
+
+
+def as_solved(run: StageRunner, stage: Stage, state: State) -> tuple[Stage, State]:
+    """Return a stage and its solution as a runner solved them, with everything that was added; for covariances."""
+    return run.as_solved(stage, state) if isinstance(run, AddingRunner) else (stage, state)

@@ -10,6 +10,7 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.gather import gather_cues
 from uni4d_fg.cues.plan import plan_cues
+from uni4d_fg.frontend.measurements.imu import ImuSamples, read_imu
 from uni4d_fg.frontend.sequence import model
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.open_video import open_video
@@ -28,6 +29,7 @@ def reconstruct(
     changes: Sequence[str] = (),
     *,
     additions: Iterable[FactorSource] = (),
+    imu: ImuSamples | str | Path | None = None,
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Reconstruction:
@@ -39,6 +41,8 @@ def reconstruct(
         config: A configuration, the name of a preset, or a YAML file; the default preset when None.
         changes: ``section.field=VALUE``, as ``--set`` of the command line; not with an opened configuration.
         additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`.
+        imu: Accelerometer and gyroscope on the clock of the frames: samples, a CSV file as EuRoC has it, or a folder
+            with ``imu.csv`` and ``imu.yaml``.
         resume: Take over stages of the folder whose input and configuration are the same.
         reporter: Progress.
 
@@ -51,6 +55,7 @@ def reconstruct(
     """
     folder = Path(run)
     settings = config if isinstance(config, Config) else load_config(config, changes)
+    samples = read_imu(Path(imu)) if isinstance(imu, str | Path) else imu
     report = None
     if isinstance(source, model.Sequence):
         sequence = source
@@ -67,5 +72,7 @@ def reconstruct(
             )
             settings = report.settings or settings
     cues = None if report is None else report.to_dict()
-    reconstruct_sequence(sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions)
+    reconstruct_sequence(
+        sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions, imu=samples
+    )
     return load_reconstruction(RunFolder(folder).reconstruction)

@@ -15,6 +15,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
+from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
@@ -30,6 +31,7 @@ from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import kinds_of, remove_graphs, write_graph_values
+from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
@@ -58,6 +60,7 @@ class _Run:
     should_stop: Callable[[], bool]
     summary: RunSummary
     recorder: RecordingRunner
+    imu: ImuSamples | None = None
 
     def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord]) -> Arrays:
         """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored."""
@@ -114,6 +117,7 @@ def reconstruct(
     should_stop: Callable[[], bool] | None = None,
     cues: dict[str, Any] | None = None,
     additions: Iterable[FactorSource] = (),
+    imu: ImuSamples | None = None,
 ) -> RunSummary:
     """Reconstruct a sequence and write the run folder.
 
@@ -127,13 +131,16 @@ def reconstruct(
         cues: What was made of the cues, for the summary: ``sources``, ``facts``, ``warnings``, ``metric``.
         additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`. They are
             not part of what ``resume`` compares.
+        imu: Inertial measurements over all frames, on their clock, for stage 2.
 
     Returns:
         The summary that is also written as ``summary.json``.
 
     Raises:
-        InputError: If a cue cannot be read, or the parts of the sequence contradict each other.
-        DegenerateProblemError: If the cues do not determine the cameras.
+        InputError: If a cue cannot be read, the parts of the sequence contradict each other, or the IMU does not cover
+            the frames.
+        ConfigError: If the configuration leaves no place for an IMU.
+        DegenerateProblemError: If the cues do not determine the cameras, or the IMU not the scale.
         SolverError: If a stage cannot be solved.
         OutputError: If a result cannot be written.
         MissingDependencyError: If the solver needs a package that is not installed.
@@ -143,6 +150,10 @@ def reconstruct(
     recorder = RecordingRunner(stage_runner(config))
     run_stage = with_additions(recorder, tuple(additions))
     windows = windows_of(config, sequence.num_frames)
+    if imu is not None:
+        check_goes_with_imu(config, len(windows))
+        imu.check_covers(sequence.timestamps)
+        cues = None if cues is None else metric_cues(cues)
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
     summary = RunSummary(
@@ -158,7 +169,7 @@ def reconstruct(
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder,
+        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder, imu,
     )  # fmt: skip
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
@@ -217,11 +228,12 @@ def _stages(
         after = key
         return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
-    key = stage_key(key, config.bundle_adjustment)
+    measured = [] if run.imu is None else [config.imu, run.imu.digest()]
+    key = stage_key(key, config.bundle_adjustment, *measured)
     scene = run.step(
         "bundle_adjustment",
         key,
-        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage),
+        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage, run.imu),
     )
     key = stage_key(key, config.nonrigid, *_searched(config))
     motion = run.step(

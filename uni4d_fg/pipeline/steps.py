@@ -15,15 +15,19 @@ from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.factors.variable_types import INTRINSICS
+from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.optim.added_factors import AddingRunner
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.pipeline.inertial import imu_fact, imu_summary
 from uni4d_fg.pipeline.rigid import rigid_objects_part
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
+from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy, energy_of
 from uni4d_fg.slam.stages.local_scale import predict_log_scale
@@ -88,11 +92,17 @@ def bundle_adjustment_step(
     config: Config,
     hooks: Hooks,
     run: StageRunner = run_stage,
+    imu: ImuSamples | None = None,
 ) -> StageRecord:
-    """Stage 2; with fixed poses and no static track the given cameras are kept as they are."""
+    """Stage 2; with fixed poses and no static track the given cameras are kept as they are.
+
+    With an IMU it is solved twice: without it, and from there with it.
+    """
     fixed = config.input.poses == "fixed"
     start = Cameras(cameras["world_T_cam"], cameras["intrinsics"], np.zeros(len(cameras["world_T_cam"])))
     freedom = Freedom(poses=not fixed, intrinsics=config.input.intrinsics == "free")
+    if imu is not None:
+        return _with_imu(sequence, labelled, start, freedom, config, hooks, run, imu)
     try:
         scene = StaticSceneSolver(config, run, hooks).adjust(labelled, start, sequence.intrinsics, freedom)
     except DegenerateProblemError as reason:
@@ -101,6 +111,28 @@ def bundle_adjustment_step(
         return _without_landmarks(cameras, config, str(reason))
     _stop_if_cancelled(scene.solves)
     return StageRecord(_scene_arrays(scene), _scene_summary(sequence, scene, config))
+
+
+def _with_imu(
+    sequence: Sequence,
+    labelled: LabelledTracks,
+    start: Cameras,
+    freedom: Freedom,
+    config: Config,
+    hooks: Hooks,
+    run: StageRunner,
+    imu: ImuSamples,
+) -> StageRecord:
+    prior = sequence.intrinsics
+    first = start_with_imu(labelled, start, prior, freedom, sequence.timestamps, imu, config, hooks, run)
+    _stop_if_cancelled(first.solves)
+    adding = AddingRunner(run, [first.source])
+    scene = StaticSceneSolver(config, adding, hooks).adjust(labelled, first.cameras, prior, freedom)
+    _stop_if_cancelled(scene.solves)
+    summary = _scene_summary(sequence, replace(scene, solves=[*first.solves, *scene.solves]), config)
+    summary["imu"] = imu_summary(first, adding)
+    summary["facts"].append(imu_fact(summary["imu"]))
+    return StageRecord(_scene_arrays(scene), summary)
 
 
 def _scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:

@@ -22,7 +22,7 @@ from uni4d_fg.factors.priors import log_scale_prior, scale_anchor
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
-from uni4d_fg.optim.added_factors import HOLDS_SCALE
+from uni4d_fg.optim.added_factors import HOLDS_SCALE, as_solved
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
@@ -168,7 +168,7 @@ def adjust_bundle(
 
     Args:
         observations: Trusted observations of static tracks.
-        start: Starting cameras; their log-scales start at zero.
+        start: Starting cameras, with the log-scales that lift the depth cue.
         prior_intrinsics: (4,) the sequence's own intrinsics.
         config: Stage 2.
         freedom: Whether poses and intrinsics move.
@@ -181,7 +181,6 @@ def adjust_bundle(
         SolverError: If the system is singular or a cue is not finite.
     """
     dropped: dict[str, int] = {}
-    start = Cameras(start.world_T_cam, start.intrinsics, np.zeros(len(start.world_T_cam)))
     observations, landmarks = _liftable(observations, start, config, dropped)
     if len(observations) == 0:
         raise DegenerateProblemError(
@@ -203,7 +202,7 @@ def adjust_bundle(
         if config.depth_prior and freedom.poses and HOLDS_SCALE not in summary.notes:
             state = hold_metric_scale(state)
         if index == rounds - 1 and energy.is_likelihood:
-            covariances = _covariances(stage, state, observations, config)
+            covariances = _covariances(*as_solved(run, stage, state), observations, config)
         state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
             counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)

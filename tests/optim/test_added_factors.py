@@ -1,0 +1,75 @@
+"""Factors that sources add to a stage, and terms that they replace."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.factors.priors import log_scale_about_common, log_scale_prior
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import COMMON_LOG_SCALE, LOG_SCALE
+from uni4d_fg.optim.added_factors import HOLDS_SCALE, AddingRunner, Addition, as_solved
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import Stage, run_stage
+
+SCALES = np.array([[0.5], [0.7], [0.6]])
+
+
+def stage() -> tuple[Stage, State]:
+    state = State({LOG_SCALE: np.zeros((3, 1))})
+    problem = Problem.over(state)
+    problem.add(log_scale_prior([0, 1, 2], measured=np.zeros((3, 1)), sigma=0.01))
+    return Stage("structure", problem, SolverConfig(relative_decrease=1e-12)), state
+
+
+def observed(frames: int = 3) -> list[object]:
+    """What something else says of the scales, by a term of the same type as the stage's own."""
+    return [log_scale_prior(list(range(frames)), measured=SCALES[:frames], sigma=0.1)]
+
+
+def test_a_replaced_term_is_gone_and_what_replaces_it_is_not() -> None:
+    declared, state = stage()
+
+    def source(_: Stage, now: State) -> Addition:
+        common = log_scale_about_common([0, 1, 2], 0, sigma=0.05)
+        pull = log_scale_about_common([0], 0, sigma=1e3)
+        return Addition([common, pull], {COMMON_LOG_SCALE: np.full((1, 1), 0.6)}, replaces=[log_scale_prior])
+
+    runner = AddingRunner(run_stage, [source])
+    solved, summary = runner(declared, state)
+    assert set(summary.final_energies) == {"log_scale_about_common"}
+    np.testing.assert_allclose(solved[LOG_SCALE], runner.known[COMMON_LOG_SCALE][(0,)][0], atol=1e-6)
+    assert COMMON_LOG_SCALE not in solved
+    assert summary.notes[HOLDS_SCALE]
+    assert set(declared.problem.energies(state)) == {"log_scale_prior"}  # the stage itself is as it was
+
+
+def test_replacing_spares_what_sources_add() -> None:
+    declared, state = stage()
+    runner = AddingRunner(run_stage, [lambda _, __: Addition(observed(), replaces=[log_scale_prior])])
+    solved, _ = runner(declared, state)
+    np.testing.assert_allclose(solved[LOG_SCALE], SCALES, atol=1e-8)
+
+
+def test_without_replacement_both_count() -> None:
+    declared, state = stage()
+    solved, _ = AddingRunner(run_stage, [lambda _, __: Addition(observed())])(declared, state)
+    assert np.abs(solved[LOG_SCALE]).max() == pytest.approx(0.7 / 101.0, rel=1e-3)
+
+
+def test_a_stage_as_it_was_solved_has_what_every_source_added() -> None:
+    declared, state = stage()
+
+    def common(_: Stage, now: State) -> Addition:
+        factors = [log_scale_about_common([0, 1, 2], 0, sigma=0.05)]
+        return Addition(factors, {COMMON_LOG_SCALE: np.zeros((1, 1))}, replaces=[log_scale_prior])
+
+    inner = AddingRunner(run_stage, [lambda _, __: Addition(observed(), is_metric=False)])
+    runner = AddingRunner(inner, [common])
+    solved, _ = runner(declared, state)
+    whole, joined = as_solved(runner, declared, solved)
+    assert {batch.name for batch in whole.problem.batches} == {"log_scale_about_common", "log_scale_prior"}
+    np.testing.assert_allclose(joined[COMMON_LOG_SCALE], 0.6, atol=1e-6)
+    np.testing.assert_allclose(joined[LOG_SCALE], solved[LOG_SCALE])
+    assert as_solved(run_stage, declared, state) == (declared, state)

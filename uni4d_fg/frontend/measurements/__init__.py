@@ -1,0 +1,1 @@
+"""Measurements of other sensors that came with a video."""

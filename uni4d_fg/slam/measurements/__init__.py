@@ -1,0 +1,1 @@
+"""Measurements of other sensors as factors of the stages."""
