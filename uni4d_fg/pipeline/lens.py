@@ -11,14 +11,16 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.errors import Cancelled, DegenerateProblemError, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
+from uni4d_fg.pipeline.steps import STOPPED
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
-from uni4d_fg.slam.lens.calibration import calibrate_lens
+from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
 from uni4d_fg.slam.lens.tracks import ideal_tracks
 
 
@@ -65,8 +67,21 @@ def known_camera(sequence: Sequence, config: Config) -> CameraModel:
 def lens_step(
     sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks, run: StageRunner
 ) -> StageRecord:
-    """Find the lens."""
-    found = calibrate_lens(labelled, sequence.image_size, sequence.intrinsics, config, sequence.lens, hooks, run)
+    """Find the lens; where 'auto' cannot, the pinhole is kept and the summary says why.
+
+    Raises:
+        DegenerateProblemError: If a model was asked for and the cues do not determine the cameras.
+        SolverError: If a model was asked for and a system is singular.
+        Cancelled: If the user interrupts.
+    """
+    try:
+        found = calibrate_lens(labelled, sequence.image_size, sequence.intrinsics, config, sequence.lens, hooks, run)
+    except (DegenerateProblemError, SolverError) as error:
+        if config.camera.model != "auto":
+            raise
+        found = LensCalibration(PINHOLE, sequence.intrinsics, note=f"no distortion was sought: {error}")
+    if hooks.should_stop is not None and hooks.should_stop():
+        raise Cancelled(STOPPED)
     arrays = {
         "model": np.array([list(PARAMETERS).index(found.lens.model)]),
         "parameters": found.lens.padded,

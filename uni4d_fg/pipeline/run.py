@@ -178,7 +178,7 @@ def reconstruct(
     key = stage_key(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
-    key, camera = _camera(run, key, labelled, run_stage)
+    key, camera = _camera(run, key, labelled)
     key, scene, motion = _stages(run, key, *camera.apply(sequence, labelled, config), windows, run_stage)
     key = stage_key(key, config.fusion)
     _fuse(run, key, labelled, scene, motion)
@@ -195,13 +195,14 @@ def reconstruct(
     return summary
 
 
-def _camera(run: _Run, key: str, labelled: LabelledTracks, run_stage: StageRunner) -> tuple[str, CameraModel]:
+def _camera(run: _Run, key: str, labelled: LabelledTracks) -> tuple[str, CameraModel]:
     """Find the lens, where it is not given or ruled out; return the key so far and the camera."""
     sequence, config = run.sequence, run.config
     if not is_sought(sequence, config):
         return key, known_camera(sequence, config)
     stages = stage_key(key, config.camera, config.bundle_adjustment, config.windows.calibration_sightings)
-    found = run.step("lens", stages, lambda hooks: lens_step(sequence, labelled, config, hooks, run_stage))
+    # Without what users add to stages: the lens is found on some of the frames.
+    found = run.step("lens", stages, lambda hooks: lens_step(sequence, labelled, config, hooks, run.recorder))
     camera = found_camera(found)
     return key if camera.lens.is_pinhole else stages, camera
 

@@ -38,7 +38,7 @@ from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
-_STOPPED = "stopped; finished stages are kept, --resume continues from them"
+STOPPED = "stopped; finished stages are kept, --resume continues from them"
 _MAX_DEPARTURE = 0.15
 """A median |log z - log cue| of moving points above this is warned of."""
 
@@ -245,7 +245,7 @@ def nonrigid_step(
             result, observations, labelled, cameras, noise, timestamps, config, hooks, run
         )
         if hooks.should_stop is not None and hooks.should_stop():
-            raise Cancelled(_STOPPED)
+            raise Cancelled(STOPPED)
         arrays, summary["rigid_objects"] = {**arrays, **objects}, part
         facts += found
     departure = _departure_from_cue(result, observations, cameras)
@@ -301,7 +301,7 @@ def frozen_cameras(scene: Arrays) -> tuple[Cameras, StaticNoise]:
 
 def _stop_if_cancelled(solves: list[SolveSummary]) -> None:
     if any(solve.termination is Termination.CANCELLED for solve in solves):
-        raise Cancelled(_STOPPED)
+        raise Cancelled(STOPPED)
 
 
 def _listed(frames: tuple[int, ...]) -> str:
