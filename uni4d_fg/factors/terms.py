@@ -6,6 +6,7 @@ from uni4d_fg.factors.depth_prior import dynamic_depth_prior, static_depth_prior
 from uni4d_fg.factors.depth_reprojection import depth_reprojection
 from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection
 from uni4d_fg.factors.priors import aspect_prior, intrinsics_prior, log_scale_prior, scale_anchor
+from uni4d_fg.factors.rigid_object import rigid_depth_prior, rigid_reprojection, rigid_smoothness
 from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness, velocity_smoothness
 
@@ -20,6 +21,9 @@ __all__ = [
     "dynamic_reprojection",
     "intrinsics_prior",
     "log_scale_prior",
+    "rigid_depth_prior",
+    "rigid_reprojection",
+    "rigid_smoothness",
     "scale_anchor",
     "static_depth_prior",
     "static_reprojection",
