@@ -15,7 +15,7 @@ from uni4d_fg.config.incremental import IncrementalConfig
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
-from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, JointConfig, NonRigidConfig
 from uni4d_fg.config.windows import WindowsConfig
 
 
@@ -61,6 +61,7 @@ class Config(Section):
     rigid_objects: RigidObjectsConfig = setting(
         RigidObjectsConfig(), "Search for moving instances that are rigid bodies, and their poses.", basic=True
     )
+    joint: JointConfig = setting(JointConfig(), "Cameras and moving points in one solve, after stage 3.", basic=True)
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
     windows: WindowsConfig = setting(WindowsConfig(), "Reconstruction in windows.", basic=True)
     incremental: IncrementalConfig = setting(

@@ -65,7 +65,7 @@ def camera_init_step(
         return StageRecord(arrays, {"solves": [], "facts": [f"poses taken from the sequence ({config.input.poses})"]})
     solver = StaticSceneSolver(config, run, hooks)
     result = solver.initialize(labelled, sequence.intrinsics, free_intrinsics=config.input.intrinsics == "free")
-    _stop_if_cancelled(result.windows)
+    stop_if_cancelled(result.windows)
     facts = [f"{len(result.windows)} windows, {sum(len(w.iterations) for w in result.windows)} iterations in all"]
     summary: dict[str, Any] = {
         "solves": [solve_dict(w) for w in result.windows],
@@ -99,11 +99,12 @@ def bundle_adjustment_step(
         if not fixed:
             raise
         return _without_landmarks(cameras, config, str(reason))
-    _stop_if_cancelled(scene.solves)
-    return StageRecord(_scene_arrays(scene), _scene_summary(sequence, scene, config))
+    stop_if_cancelled(scene.solves)
+    return StageRecord(scene_arrays(scene), _scene_summary(sequence, scene, config))
 
 
-def _scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
+def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
+    """Return a static scene as a record holds it."""
     return {
         "world_T_cam": scene.cameras.world_T_cam,
         "intrinsics": scene.cameras.intrinsics,
@@ -119,7 +120,7 @@ def _scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
 
 def _scene_summary(sequence: Sequence, scene: StaticScene, config: Config) -> dict[str, Any]:
     solves = [solve_dict(s) for s in scene.solves]
-    summary = bundle_summary(sequence, _scene_arrays(scene), len(scene.observations), scene.dropped, solves)
+    summary = bundle_summary(sequence, scene_arrays(scene), len(scene.observations), scene.dropped, solves)
     summary["exact_energy"] = paper_energy(scene, config.normalization)
     return summary
 
@@ -187,7 +188,7 @@ def nonrigid_step(
     """Stage 3; empty without dynamic tracks. With ``timestamps`` (T,), s, rigid objects too if the config asks."""
     observations = observations_of(labelled, TrackLabel.DYNAMIC)
     cameras, noise = frozen_cameras(scene)
-    observations, cameras, noise, facts = _correct_cue(observations, labelled, cameras, noise, scene, config)
+    observations, cameras, noise, facts = correct_cue(observations, labelled, cameras, noise, scene, config)
     result = solve_nonrigid(
         observations,
         labelled.instance.astype(np.int64),
@@ -199,7 +200,7 @@ def nonrigid_step(
         run=run,
     )
     solves = [] if result.solve is None else [result.solve]
-    _stop_if_cancelled(solves)
+    stop_if_cancelled(solves)
     arrays = {
         "points": result.points,
         "observed": result.observed,
@@ -236,7 +237,7 @@ def _departure_from_cue(result: DynamicScene, observations: Observations, camera
     return float(np.median(np.abs(ratio)))
 
 
-def _correct_cue(
+def correct_cue(
     observations: Observations,
     labelled: LabelledTracks,
     cameras: Cameras,
@@ -267,7 +268,8 @@ def frozen_cameras(scene: Arrays) -> tuple[Cameras, StaticNoise]:
     return Cameras(scene["world_T_cam"], scene["intrinsics"], log_scale), StaticNoise(pixel, relative)
 
 
-def _stop_if_cancelled(solves: list[SolveSummary]) -> None:
+def stop_if_cancelled(solves: list[SolveSummary]) -> None:
+    """Raise what ends a run whose last solve was cancelled."""
     if any(solve.termination is Termination.CANCELLED for solve in solves):
         raise Cancelled(_STOPPED)
 
