@@ -6,6 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from uni4d_fg.errors import SolverError
+from uni4d_fg.factors import factor, factor_type
+from uni4d_fg.factors import variable as variables
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import (
     DYNAMIC_POINT,
@@ -13,10 +16,14 @@ from uni4d_fg.factors.variable_types import (
     INTRINSICS,
     LANDMARK,
     LOG_SCALE,
+    OBJECT_POSE,
     POSE,
     VELOCITY,
+    point_variable,
 )
 from uni4d_fg.geometry import se3
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.solve import solve
 
 
 @pytest.fixture
@@ -119,3 +126,32 @@ def test_rows_are_found_by_key(state: State) -> None:
     for missing in (LANDMARK.key(4), gtsam.symbol("z", 0), DYNAMIC_POINT.key(1, 2)):
         with pytest.raises(KeyError, match=str(missing)):
             state.rows_of([POSE.key(0), missing])
+
+
+def test_a_type_that_is_not_there_is_named(state: State) -> None:
+    with pytest.raises(SolverError, match="the state has no object_pose variables, only pose, "):
+        state[OBJECT_POSE]
+
+
+def test_a_type_that_was_declared_anew_does_not_fit_an_old_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variables, "_REGISTERED", dict(variables._REGISTERED))
+    first = point_variable("marker", "m", ("object",))
+    held = State({first: np.zeros((2, 3))})
+    again = point_variable("marker", "m", ("object",))
+
+    @factor(again, dim=3, name="marker_position")
+    def position(marker: np.ndarray) -> np.ndarray:
+        return marker
+
+    monkeypatch.delitem(factor_type._LISTED, "marker_position")
+    problem = Problem.over(held).add(position([0, 1], sigma=0.1))
+    prior = gtsam.PriorFactorPoint3(again.key(0), np.zeros(3), gtsam.noiseModel.Unit.Create(3))
+    for attempt in (
+        lambda: held[again],
+        lambda: problem.energy(held),
+        lambda: solve(problem, held),
+        lambda: problem.add(prior, state=held),
+    ):
+        with pytest.raises(SolverError, match="'marker' was declared twice, and this state and what reads it hold"):
+            attempt()
+    np.testing.assert_array_equal(State({again: np.zeros((2, 3))})[again], held[first])

@@ -167,9 +167,10 @@ def test_a_name_or_a_key_character_is_given_once() -> None:
         point_variable("marker", "x")
     with pytest.raises(SolverError, match=r"'pose' \(x\): the name or the key character"):
         VariableType("pose", "x", vector_space(3))
-    with pytest.raises(SolverError, match="needs one key character and one or two index names"):
-        point_variable("marker", "mm")
-    with pytest.raises(SolverError, match="needs one key character and one or two index names"):
+    for symbol in ("", "mm", "é", "Ж", "²", "7", "_", " "):
+        with pytest.raises(SolverError, match=f"'marker': the key character '{symbol}' must be one letter, a to z"):
+            point_variable("marker", symbol)
+    with pytest.raises(SolverError, match="needs one or two index names, got"):
         point_variable("marker", "m", index=("object", "camera", "frame"))
     assert variable_types() == before
 

@@ -1,13 +1,11 @@
 """The pages about the configuration and the preset ``default``, generated from the models.
 
-``python -m uni4d_fg.config.docs`` in the source checkout writes them, ``--check`` tells whether they are up to date.
+``python -m uni4d_fg.cli.docs`` in the source checkout writes them.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,7 @@ DEFAULT_PRESET = Path("configs") / "default.yaml"
 
 _HEAD = """# Configuration
 
-This page is generated from the models in `uni4d_fg/config`; `python -m uni4d_fg.config.docs` writes it anew.
+This page is generated from the models in `uni4d_fg/config`; `python -m uni4d_fg.cli.docs` writes it anew.
 
 A configuration is built in layers, and each layer holds only what it changes:
 
@@ -52,7 +50,7 @@ whole, and its weights, thresholds and annealing may be changed from there.
 
 _ADVANCED_HEAD = """# Advanced configuration
 
-This page is generated from the models in `uni4d_fg/config`; `python -m uni4d_fg.config.docs` writes it anew.
+This page is generated from the models in `uni4d_fg/config`; `python -m uni4d_fg.cli.docs` writes it anew.
 
 These are the method's own numbers: fields with bounds like those of [configuration.md](configuration.md), which seldom
 need another value. `uni4d-fg config --all` prints them with the others.
@@ -62,7 +60,7 @@ _DEFAULT_HEAD = """\
 # A maximum a posteriori estimate with noise measured on the static scene.
 #
 # It changes nothing: these are the defaults of the fields that a user turns (docs/configuration.md). The method's own
-# numbers are on docs/configuration_advanced.md. `python -m uni4d_fg.config.docs` writes this file anew.
+# numbers are on docs/configuration_advanced.md. `python -m uni4d_fg.cli.docs` writes this file anew.
 # A file of your own holds only the fields you change, for example:
 #
 #   preset: default
@@ -111,21 +109,7 @@ def default_preset() -> str:
     return _DEFAULT_HEAD + commented_yaml(field for field in describe_fields(Config()) if field.basic)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Write the files, or with ``--check`` end with an error if one is out of date."""
-    parser = argparse.ArgumentParser(description="Generate the pages about the configuration and configs/default.yaml.")
-    parser.add_argument("--check", action="store_true", help="only check that they are up to date")
-    options = parser.parse_args(arguments)
-    for path, text in _files():
-        if not path.parent.is_dir():
-            sys.exit(f"there is no folder {path.parent} here: run this in the source checkout")
-        if not options.check:
-            path.write_text(text, encoding="utf-8")
-        elif not path.exists() or path.read_text(encoding="utf-8") != text:
-            sys.exit(f"{path} is out of date: run python -m uni4d_fg.config.docs")
-
-
-def _files() -> Iterator[tuple[Path, str]]:
+def files() -> Iterator[tuple[Path, str]]:
     """Yield each file and what it should hold; the preset first, as the pages read it."""
     yield DEFAULT_PRESET, default_preset()
     yield PAGE, configuration_page()
@@ -195,7 +179,3 @@ def _value(value: Any) -> str:
     if isinstance(value, str):
         return f"`{value}`"
     return f"`{json.dumps(value)}`"
-
-
-if __name__ == "__main__":
-    main()

@@ -17,7 +17,7 @@ from uni4d_fg.config.incremental import IncrementalConfig
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
-from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, NonRigidConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, JointConfig, NonRigidConfig
 from uni4d_fg.config.windows import WindowsConfig
 
 
@@ -65,6 +65,7 @@ class Config(Section):
         RigidObjectsConfig(), "Search for moving instances that are rigid bodies, and their poses.", basic=True
     )
     imu: ImuConfig = setting(ImuConfig(), "Inertial measurements in stage 2, where an IMU is given.", basic=True)
+    joint: JointConfig = setting(JointConfig(), "Cameras and moving points in one solve, after stage 3.", basic=True)
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
     windows: WindowsConfig = setting(WindowsConfig(), "Reconstruction in windows.", basic=True)
     incremental: IncrementalConfig = setting(

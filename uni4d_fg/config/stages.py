@@ -219,6 +219,18 @@ class NonRigidConfig(Section):
     )
 
 
+class JointConfig(Section):
+    """The joint energy: cameras, static and moving points free together, with the terms of stages 2 and 3."""
+
+    enabled: bool = setting(
+        False,
+        "Solve the joint energy after stage 3, from where the stages ended. Off by default: it takes longer than all "
+        "stages together, and its cameras are worse (docs/results.md). Not in windows.",
+        basic=True,
+    )
+    solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-4), "Solver.")
+
+
 class FusionConfig(Section):
     """Dense depth that agrees with the sparse points, and the 4D cloud."""
 

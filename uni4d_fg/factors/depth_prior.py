@@ -4,9 +4,9 @@ r"""Depth prior: a point's depth agrees with the depth cue up to one log-scale p
 
 ``depth`` is the cue at the observation (metres), ``log_scale`` the frame's s_t: the cue is too small by the
 factor exp(s_t). Below the near plane log is continued by its tangent, so that a point behind the camera is
-pushed forward. Two types: one on pose, landmark and log-scale (stage 2), one on a dynamic point with
-frozen camera and log-scale (stage 3). Not in the paper: without it the scene may shrink towards the camera
-at no cost.
+pushed forward. Three types: on pose, landmark and log-scale (stage 2), on a dynamic point with frozen camera
+and log-scale (stage 3), and on pose, dynamic point and log-scale (joint energy). Not in the paper: without it
+the scene may shrink towards the camera at no cost.
 """
 
 from __future__ import annotations
@@ -63,3 +63,12 @@ def dynamic_depth_prior_jacobian(
     """Return the residual and its Jacobian with respect to the point, (N, 1, 3)."""
     r, (_, point, _) = static_depth_prior_jacobian(world_T_cam, dynamic_point, log_scale[:, None], depth=depth)
     return r, [point]
+
+
+@factor(POSE, DYNAMIC_POINT, LOG_SCALE, data={"depth": ()}, dim=1, term="depth_prior", stack=1)
+def joint_dynamic_depth_prior(world_T_cam: Array, dynamic_point: Array, log_scale: Array, *, depth: Array) -> Array:
+    """Return (N, 1) of poses (N, 4, 4), points (N, 3), log-scales (N, 1) and cue depths (N,)."""
+    return static_depth_prior.residual(world_T_cam, dynamic_point, log_scale, depth=depth)
+
+
+joint_dynamic_depth_prior.jacobian(static_depth_prior_jacobian)

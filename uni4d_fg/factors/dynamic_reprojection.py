@@ -1,9 +1,10 @@
-r"""Dynamic reprojection, E_NR: a point of one frame seen by that frame's frozen camera.
+r"""Dynamic reprojection, E_NR: a point of one frame seen by that frame's camera.
 
     r = z_{k,t} - pi_K(p_{k,t}, xi_t)    [px], 2-vector
 
 Variable: p_{k,t} (``dynamic_point``, world). Data: the pixel ``uv``, the frozen pose ``world_T_cam`` and
-the frozen ``intrinsics``. Source: Uni4D, non-rigid bundle adjustment term.
+the frozen ``intrinsics``. The second type has pose and intrinsics as variables: the formula is then that of
+a landmark. Source: Uni4D, non-rigid bundle adjustment term.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from __future__ import annotations
 from uni4d_fg.arrays import Array, FloatArray
 from uni4d_fg.factors.factor_type import factor
 from uni4d_fg.factors.projection import chain_to_world_point, projection_derivatives
-from uni4d_fg.factors.variable_types import DYNAMIC_POINT
+from uni4d_fg.factors.static_reprojection import native as native_projection
+from uni4d_fg.factors.static_reprojection import static_reprojection, static_reprojection_jacobian
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS, POSE
 from uni4d_fg.geometry.camera import project, world_to_camera
 
 
@@ -29,3 +32,15 @@ def dynamic_reprojection_jacobian(
     x = world_to_camera(world_T_cam, dynamic_point)
     by_x, _ = projection_derivatives(intrinsics, x)
     return uv - project(intrinsics, x), [-chain_to_world_point(by_x, world_T_cam)]
+
+
+@factor(
+    POSE, DYNAMIC_POINT, INTRINSICS,
+    data={"uv": 2}, dim=2, term=dynamic_reprojection.term, stack=1, native=native_projection,
+)  # fmt: skip
+def joint_dynamic_reprojection(world_T_cam: Array, dynamic_point: Array, intrinsics: Array, *, uv: Array) -> Array:
+    """Return (N, 2) px of poses (N, 4, 4), points (N, 3), intrinsics (N, 4) and pixels (N, 2)."""
+    return static_reprojection.residual(world_T_cam, dynamic_point, intrinsics, uv=uv)
+
+
+joint_dynamic_reprojection.jacobian(static_reprojection_jacobian)

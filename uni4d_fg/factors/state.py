@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.errors import SolverError
 from uni4d_fg.factors.variable import VariableType, locate
 
 Delta = Mapping[VariableType, FloatArray]
@@ -20,6 +21,9 @@ class State:
     """Values of every variable of a problem. Immutable: :meth:`retract` returns a new state.
 
     Row i of a type's array is the variable whose key has the numbers ``index[type][i]``.
+
+    Raises:
+        SolverError: Where a type is asked for that the state does not have, or has in another declaration.
     """
 
     arrays: Mapping[VariableType, FloatArray]
@@ -28,7 +32,10 @@ class State:
     """Numbers of the keys per type, (n,) or (n, k); the row number (and frame 0) where a type is absent."""
 
     def __getitem__(self, variable: VariableType) -> FloatArray:
-        return self.arrays[variable]
+        try:
+            return self.arrays[variable]
+        except KeyError:
+            raise SolverError(self._missing(variable)) from None
 
     def __contains__(self, variable: object) -> bool:
         return variable in self.arrays
@@ -71,14 +78,19 @@ class State:
 
         Raises:
             KeyError: If the state has no variable with one of the keys.
+            SolverError: If it has those of another declaration of the type.
         """
         place: dict[VariableType, dict[int, int]] = {}
         out = []
         for key in keys:
             found = locate(key)
-            if found is None or found[0] not in self.arrays:
+            if found is None:
                 raise KeyError(key)
             variable = found[0]
+            if variable not in self.arrays:
+                if any(held.name == variable.name for held in self.arrays):
+                    raise SolverError(self._missing(variable))
+                raise KeyError(key)
             if variable not in place:
                 place[variable] = {k: row for row, k in enumerate(self.keys(variable))}
             out.append((variable, place[variable][key]))
@@ -110,6 +122,15 @@ class State:
                     out[row] = variable.from_gtsam(values, key)
             moved[variable] = out
         return State(moved, self.index)
+
+    def _missing(self, variable: VariableType) -> str:
+        """Return what to say of a type that is not here."""
+        if any(held.name == variable.name for held in self.arrays):
+            return (
+                f"variable type '{variable}' was declared twice, and this state and what reads it hold different "
+                "declarations; make both anew after the last one"
+            )
+        return f"the state has no {variable} variables, only {', '.join(map(str, self.arrays)) or 'none at all'}"
 
     @classmethod
     def from_values(cls, values: gtsam.Values) -> State:

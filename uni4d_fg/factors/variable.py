@@ -98,15 +98,16 @@ _REGISTERED: dict[str, VariableType] = {}
 class VariableType:
     """A kind of variable.
 
-    Declaring a type again with the same name, key character and manifold (as a notebook does) replaces it.
+    Declaring a type again with the same name, key character and dimension (as a notebook does) replaces it; states and
+    factors made with the earlier declaration are then refused.
 
     Raises:
-        SolverError: On construction, if another type has the name or the key character.
+        SolverError: On construction, if another type has the name or the key character, or that is no ASCII letter.
     """
 
     name: str
     symbol: str
-    """Key character."""
+    """Key character: one ASCII letter, as ``gtsam.Symbol`` has it."""
     manifold: Manifold
     index: tuple[str, ...] = ("frame",)
     """What the one or two numbers of a key are called; of two, the second is a frame."""
@@ -122,6 +123,12 @@ class VariableType:
     """Dimension of GTSAM's tangent; that of the manifold when 0."""
 
     def __post_init__(self) -> None:
+        if not (len(self.symbol) == 1 and self.symbol.isascii() and self.symbol.isalpha()):
+            raise SolverError(
+                f"variable type '{self.name}': the key character '{self.symbol}' must be one letter, a to z or A to Z"
+            )
+        if len(self.index) not in (1, 2):
+            raise SolverError(f"variable type '{self.name}': needs one or two index names, got {self.index}")
         for other in _REGISTERED.values():
             again = (other.name, other.symbol) == (self.name, self.symbol) and other.dim == self.dim
             if (other.name == self.name or other.symbol == self.symbol) and not again:
@@ -129,8 +136,6 @@ class VariableType:
                     f"variable type '{self.name}' ({self.symbol}): the name or the key character is that of "
                     f"'{other.name}' ({other.symbol}); every type needs its own"
                 )
-        if len(self.symbol) != 1 or len(self.index) not in (1, 2):
-            raise SolverError(f"variable type '{self.name}': needs one key character and one or two index names")
         _REGISTERED[self.name] = self
 
     @property

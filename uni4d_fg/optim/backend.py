@@ -84,7 +84,7 @@ def make_objective(backend: Backend, problem: Problem, state: State, config: Sol
     if compiled:
         if not (why := cpp_pairs.refusal(problem)):
             return Planned(cpp_pairs.CppPairObjective(problem, state, config))
-        if problem.eliminated is not None and not (why := cpp_schur.refusal(problem, state)):
+        if problem.eliminated is not None and not (why := cpp_schur.refusal(problem, state) or _too_many(problem)):
             return Planned(cpp_schur.CppSchurObjective(problem, state, config))
     if reason := block_reason(problem):
         return Planned(BlockObjective(problem, state, config), reason)
@@ -106,5 +106,10 @@ def block_reason(problem: Problem) -> str:
         return f"a factor reads two {points} variables"
     if points is not None and problem.is_free_in_part(points):
         return f"some entries of a {points} variable are frozen and others are not"
-    columns = sum(int(mask.sum()) for variable, mask in problem.free.items() if variable is not points)
+    return _too_many(problem)
+
+
+def _too_many(problem: Problem) -> str:
+    """Return why a dense system of what is not eliminated would be too large; empty if it would not."""
+    columns = sum(int(mask.sum()) for variable, mask in problem.free.items() if variable is not problem.eliminated)
     return f"{columns} entries are free beside the eliminated points" if columns > MOST_DENSE_COLUMNS else ""

@@ -19,6 +19,7 @@ _MOST_CORE = 3000
 _REACH = 2
 """Frames apart up to which the points of a track stay coupled."""
 _CHUNK = 512
+"""Points eliminated together: bounds the memory of their couplings."""
 
 
 @dataclass(frozen=True)

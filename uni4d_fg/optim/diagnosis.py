@@ -10,6 +10,7 @@ from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.optim.problem import Problem
 
 _RELATIVE_ZERO = 1e-10
+"""Information below this part of the largest is rounding."""
 _LISTED = 5
 
 GAUGE_MESSAGE = (

@@ -26,7 +26,9 @@ from uni4d_fg.optim.summary import IterationRecord, SolveSummary, Termination
 StateT = TypeVar("StateT")
 
 _MIN_GAIN = 1e-4
+"""A step is accepted that brings this part of the predicted decrease, or more."""
 _MIN_DAMPING = 1e-12
+"""Below, damping no longer changes a step in double precision."""
 _NEAR = 2e-3
 """A step that lowers the energy by less than this part is near the minimum."""
 

@@ -11,6 +11,7 @@ _KINDS = {
     "camera_init": ("camera_init",),
     "bundle_adjustment": ("camera_init", "bundle_adjustment", "structure"),
     "nonrigid": ("nonrigid",),
+    "joint": ("joint", "joint_structure"),
 }
 """Kinds of solves that a step of the pipeline makes; in windows, stage 1 is part of bundle adjustment."""
 

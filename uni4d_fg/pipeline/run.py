@@ -32,6 +32,7 @@ from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import kinds_of, remove_graphs, write_graph_values
 from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
+from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
@@ -216,8 +217,16 @@ def _stages(
     windows: list[Window],
     run_stage: StageRunner,
 ) -> tuple[str, Arrays, Arrays]:
-    """Run stages 1 to 3, as one graph or in windows; return the key so far and the records of stages 2 and 3."""
+    """Run stages 1 to 3, as one graph or in windows, and the joint solve.
+
+    Returns:
+        The key so far, and the records of the static scene and of what moves: both are that of the joint solve if there
+        is one.
+    """
     if windows:
+        if config.joint.enabled:
+            run.summary.warnings.append(NOT_IN_WINDOWS)
+        _forget(run, "joint")
         parts = WindowedRun(
             sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
             run.reporter, run.should_stop,
@@ -242,7 +251,18 @@ def _stages(
         key,
         lambda hooks: nonrigid_step(labelled, scene, config, hooks, run_stage, sequence.timestamps),
     )
-    return key, scene, motion
+    if not config.joint.enabled:
+        _forget(run, "joint")
+        return key, scene, motion
+    key = stage_key(key, config.joint)
+    both = run.step("joint", key, lambda hooks: joint_step(sequence, labelled, scene, motion, config, hooks, run_stage))
+    return key, both, both
+
+
+def _forget(run: _Run, name: str) -> None:
+    """Remove what an earlier run left of a step that this one does not have."""
+    run.store.discard(name)
+    remove_graphs(run.folder, name)
 
 
 def _searched(config: Config) -> list[RigidObjectsConfig]:

@@ -69,7 +69,7 @@ def camera_init_step(
         return StageRecord(arrays, {"solves": [], "facts": [f"poses taken from the sequence ({config.input.poses})"]})
     solver = StaticSceneSolver(config, run, hooks)
     result = solver.initialize(labelled, sequence.intrinsics, free_intrinsics=config.input.intrinsics == "free")
-    _stop_if_cancelled(result.windows)
+    stop_if_cancelled(result.windows)
     facts = [f"{len(result.windows)} windows, {sum(len(w.iterations) for w in result.windows)} iterations in all"]
     summary: dict[str, Any] = {
         "solves": [solve_dict(w) for w in result.windows],
@@ -109,8 +109,8 @@ def bundle_adjustment_step(
         if not fixed:
             raise
         return _without_landmarks(cameras, config, str(reason))
-    _stop_if_cancelled(scene.solves)
-    return StageRecord(_scene_arrays(scene), _scene_summary(sequence, scene, config))
+    stop_if_cancelled(scene.solves)
+    return StageRecord(scene_arrays(scene), _scene_summary(sequence, scene, config))
 
 
 def _with_imu(
@@ -125,17 +125,18 @@ def _with_imu(
 ) -> StageRecord:
     prior = sequence.intrinsics
     first = start_with_imu(labelled, start, prior, freedom, sequence.timestamps, imu, config, hooks, run)
-    _stop_if_cancelled(first.solves)
+    stop_if_cancelled(first.solves)
     adding = AddingRunner(run, [first.source])
     scene = StaticSceneSolver(config, adding, hooks).adjust(labelled, first.cameras, prior, freedom)
-    _stop_if_cancelled(scene.solves)
+    stop_if_cancelled(scene.solves)
     summary = _scene_summary(sequence, replace(scene, solves=[*first.solves, *scene.solves]), config)
     summary["imu"] = imu_summary(first, adding)
     summary["facts"].append(imu_fact(summary["imu"]))
-    return StageRecord(_scene_arrays(scene), summary)
+    return StageRecord(scene_arrays(scene), summary)
 
 
-def _scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
+def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
+    """Return a static scene as a record holds it."""
     return {
         "world_T_cam": scene.cameras.world_T_cam,
         "intrinsics": scene.cameras.intrinsics,
@@ -151,7 +152,7 @@ def _scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
 
 def _scene_summary(sequence: Sequence, scene: StaticScene, config: Config) -> dict[str, Any]:
     solves = [solve_dict(s) for s in scene.solves]
-    summary = bundle_summary(sequence, _scene_arrays(scene), len(scene.observations), scene.dropped, solves)
+    summary = bundle_summary(sequence, scene_arrays(scene), len(scene.observations), scene.dropped, solves)
     summary["exact_energy"] = paper_energy(scene, config.normalization)
     return summary
 
@@ -219,7 +220,7 @@ def nonrigid_step(
     """Stage 3; empty without dynamic tracks. With ``timestamps`` (T,), s, rigid objects too if the config asks."""
     observations = observations_of(labelled, TrackLabel.DYNAMIC)
     cameras, noise = frozen_cameras(scene)
-    observations, cameras, noise, facts = _correct_cue(observations, labelled, cameras, noise, scene, config)
+    observations, cameras, noise, facts = correct_cue(observations, labelled, cameras, noise, scene, config)
     result = solve_nonrigid(
         observations,
         labelled.instance.astype(np.int64),
@@ -231,7 +232,7 @@ def nonrigid_step(
         run=run,
     )
     solves = [] if result.solve is None else [result.solve]
-    _stop_if_cancelled(solves)
+    stop_if_cancelled(solves)
     arrays = {
         "points": result.points,
         "observed": result.observed,
@@ -268,7 +269,7 @@ def _departure_from_cue(result: DynamicScene, observations: Observations, camera
     return float(np.median(np.abs(ratio)))
 
 
-def _correct_cue(
+def correct_cue(
     observations: Observations,
     labelled: LabelledTracks,
     cameras: Cameras,
@@ -299,7 +300,8 @@ def frozen_cameras(scene: Arrays) -> tuple[Cameras, StaticNoise]:
     return Cameras(scene["world_T_cam"], scene["intrinsics"], log_scale), StaticNoise(pixel, relative)
 
 
-def _stop_if_cancelled(solves: list[SolveSummary]) -> None:
+def stop_if_cancelled(solves: list[SolveSummary]) -> None:
+    """Raise what ends a run whose last solve was cancelled."""
     if any(solve.termination is Termination.CANCELLED for solve in solves):
         raise Cancelled(STOPPED)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import resource
 from collections import defaultdict
@@ -150,3 +151,27 @@ def test_without_rerun_there_is_one_sentence(source: Run, tmp_path: Path, monkey
     with pytest.raises(MissingDependencyError, match=r"pip install 'uni4d-fg\[export\]'"):
         export_run(source, ["tum", "rrd"], tmp_path / "out")
     assert not (tmp_path / "out").exists()  # found before anything is written
+
+
+def test_rigid_objects_are_drawn_where_they_have_a_pose(source: Run, tmp_path: Path) -> None:
+    result = source.reconstruction
+    poses = np.full((1, source.num_frames, 4, 4), np.nan)
+    poses[0, 1:] = result.world_T_cam[1:]
+    instance = result.dynamic_instance[:1]
+    objects = dataclasses.replace(
+        result, object_instance=instance, object_reference=np.ones(1, np.int32),
+        object_observed=np.ones((1, source.num_frames), bool), object_world_T_object=poses,
+    )  # fmt: skip
+    changed = Run(source.folder.root, source.need_sequence)
+    changed.__dict__["reconstruction"] = objects
+    (report,) = export_run(changed, ["rrd"], tmp_path)
+    rows = [row for row in read(report.folder / "scene.rrd")[f"/world/object_{instance[0]}"] if "frame" in row]
+    drawn = {row["frame"]: row for row in rows if row.get("Transform3D:translation")}
+    assert sorted(drawn) == list(range(1, source.num_frames))
+    for frame, row in drawn.items():
+        np.testing.assert_allclose(row["Transform3D:translation"][0], poses[0, frame, :3, 3], atol=1e-6)
+        np.testing.assert_allclose(matrix(row["Transform3D:mat3x3"][0]), poses[0, frame, :3, :3], atol=1e-6)
+        axes = np.array(row["Arrows3D:vectors"])
+        np.testing.assert_allclose(axes, axes[0, 0] * np.eye(3), atol=1e-6)
+        assert axes[0, 0] > 0
+    assert [row["frame"] for row in rows if row.get("Clear:is_recursive")] == [0]

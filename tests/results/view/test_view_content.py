@@ -20,8 +20,9 @@ from uni4d_fg.results.colors import (
     value_range,
 )
 from uni4d_fg.results.pictures.figure import thumbnail
+from uni4d_fg.results.run_clouds import ColoredPoints
 from uni4d_fg.results.view.coloring import ColorBy, Coloring, values_of
-from uni4d_fg.results.view.content import ColoredPoints, Limits, RunClouds
+from uni4d_fg.results.view.content import Limits, RunClouds
 from uni4d_fg.results.view.layers import spaced_cameras
 from uni4d_fg.results.view.trails import trail_segments
 

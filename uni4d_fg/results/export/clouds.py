@@ -1,10 +1,11 @@
-"""The point clouds of a run: as it wrote them, or else built anew from its depth."""
+"""The point clouds that exports hand on: those of the run, or its points where it has no dense depth."""
 
 from __future__ import annotations
 
-from uni4d_fg.results.clouds import read_ply
-from uni4d_fg.results.fusion.clouds import Cloud, dynamic_cloud
-from uni4d_fg.results.fusion.clouds import static_cloud as build_static_cloud
+import numpy as np
+
+from uni4d_fg.results import run_clouds
+from uni4d_fg.results.fusion.clouds import Cloud
 from uni4d_fg.results.run import Run
 
 
@@ -15,16 +16,11 @@ def static_cloud(run: Run) -> Cloud:
         InputError: If a file of the run or its sequence cannot be read.
         MissingDependencyError: If Open3D cannot be loaded.
     """
-    if run.folder.static_cloud.exists():
-        return Cloud(*read_ply(run.folder.static_cloud))
-    result = run.reconstruction
-    if not run.folder.depth.exists():
-        return Cloud(result.landmarks, result.landmark_color)
-    sequence, depth = run.need_sequence(), run.need_depth("a cloud")
-    return build_static_cloud(
-        sequence.images, depth, sequence.masks, result.intrinsics, result.world_T_cam, run.config.fusion,
-        lens=result.lens,
-    )  # fmt: skip
+    found, _ = run_clouds.static_cloud(run, run.config.fusion)
+    if found is not None:
+        return Cloud(found.points.astype(np.float64), found.colors)
+    _need_what_clouds_are_made_of(run)
+    return Cloud(run.reconstruction.landmarks, run.reconstruction.landmark_color)
 
 
 def moving_cloud(run: Run, frame: int) -> Cloud:
@@ -34,15 +30,17 @@ def moving_cloud(run: Run, frame: int) -> Cloud:
         InputError: If a file of the run or its sequence cannot be read.
         MissingDependencyError: If Open3D cannot be loaded.
     """
-    path = run.folder.dynamic_cloud(frame)
-    if path.exists():
-        return Cloud(*read_ply(path))
+    found = run_clouds.moving_cloud(run, frame, run.config.fusion)
+    if found is not None:
+        return Cloud(found.points.astype(np.float64), found.colors)
+    _need_what_clouds_are_made_of(run)
     result = run.reconstruction
-    if not run.folder.depth.exists():
-        seen = result.dynamic_observed[:, frame]
-        return Cloud(result.dynamic_points[seen, frame], result.dynamic_color[seen])
-    sequence, depth = run.need_sequence(), run.need_depth("a cloud")
-    return dynamic_cloud(
-        sequence.images[frame], depth[frame], sequence.masks[frame],
-        result.intrinsics, result.world_T_cam[frame], run.config.fusion, result.lens,
-    )  # fmt: skip
+    seen = result.dynamic_observed[:, frame]
+    return Cloud(result.dynamic_points[seen, frame], result.dynamic_color[seen])
+
+
+def _need_what_clouds_are_made_of(run: Run) -> None:
+    """Refuse to stand in for a dense cloud that the run's depth would give."""
+    if run.folder.depth.exists():
+        run.need_sequence()
+        run.need_depth("a cloud")

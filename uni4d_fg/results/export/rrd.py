@@ -10,6 +10,7 @@ Entities, all below ``world`` (x right, y down, z forward, metres):
 | `world/static` | static cloud | static |
 | `world/dynamic` | cloud of what moves | per frame |
 | `world/trajectories` | the last steps of every moving point that is there | per frame |
+| `world/object_ID` | pose and axes of a rigid object, where it has one | per frame |
 
 Every frame has a place on the time lines ``frame`` (its number) and ``time`` (seconds since the first). rerun puts
 pixel centres at 0.5 (https://github.com/rerun-io/rerun/issues/3896): 0.5 is added to cx and cy.
@@ -32,7 +33,6 @@ from uni4d_fg.results.export.model import ExportJob
 from uni4d_fg.slam.reconstruction import Reconstruction
 
 CAMERA, IMAGE = "world/camera", "world/camera/image"
-"""Successive multiples of the golden ratio are far apart on the circle of hues, however many there are."""
 
 
 def write_rrd(job: ExportJob) -> None:
@@ -94,12 +94,29 @@ def _log_frames(rerun: Any, recording: Any, job: ExportJob) -> None:
         recording.log("world/dynamic", _points(rerun, cloud.points, cloud.colors))
         strips, row = trails(result, frame, job.options.trail)
         recording.log("world/trajectories", rerun.LineStrips3D(strips, colors=palette[row]))
+        _log_objects(rerun, recording, result, frame)
         moving += len(cloud.points)
         job.advance(frame + 1)
     job.figures |= {"frames": run.num_frames, "dynamic_points": moving}
     job.facts.append(
         f"{run.num_frames} frames with images, {moving} moving points, {len(result.dynamic_track)} trajectories"
     )
+
+
+def _log_objects(rerun: Any, recording: Any, result: Reconstruction, frame: int) -> None:
+    """Log the rigid objects of a frame; one that has no pose in it is not drawn."""
+    if result.object_instance is None or result.object_world_T_object is None:
+        return
+    for instance, poses in zip(result.object_instance.tolist(), result.object_world_T_object, strict=True):
+        entity, pose = f"world/object_{instance}", poses[frame]
+        if not np.isfinite(pose).all():
+            recording.log(entity, rerun.Clear(recursive=False))
+            continue
+        points = result.dynamic_points[result.dynamic_instance == instance, frame]
+        distance = np.linalg.norm(points - pose[:3, 3], axis=1)
+        length = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 0.1
+        axes = rerun.Arrows3D(vectors=length * np.eye(3), colors=255 * np.eye(3, dtype=np.uint8))
+        recording.log(entity, rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), axes)
 
 
 def trails(result: Reconstruction, frame: int, length: int) -> tuple[list[Float32Array], Int32Array]:

@@ -20,7 +20,7 @@ from uni4d_fg.results.colors import (
 from uni4d_fg.results.measures import pose_sigmas
 from uni4d_fg.results.residuals import landmark_sigma, reprojection_residuals
 from uni4d_fg.results.run import Run
-from uni4d_fg.results.view.content import ColoredPoints
+from uni4d_fg.results.run_clouds import ColoredPoints
 
 _DIMMED = 0.45
 _CAMERA = (88, 130, 190)

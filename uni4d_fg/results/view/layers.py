@@ -12,8 +12,9 @@ from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.results.colors import CURRENT_ORANGE
 from uni4d_fg.results.pictures.figure import thumbnail
 from uni4d_fg.results.run import Run
+from uni4d_fg.results.run_clouds import ColoredPoints
 from uni4d_fg.results.view.coloring import Coloring
-from uni4d_fg.results.view.content import ColoredPoints, Limits, RunClouds
+from uni4d_fg.results.view.content import Limits, RunClouds
 from uni4d_fg.results.view.trails import trail_segments
 from uni4d_fg.slam.reconstruction import Reconstruction
 

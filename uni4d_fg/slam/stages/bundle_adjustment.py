@@ -239,6 +239,7 @@ def refine_structure(
     config: BundleAdjustmentConfig,
     hooks: Hooks | None = None,
     run: StageRunner = run_stage,
+    kind: str = "structure",
 ) -> tuple[State, StaticNoise, list[SolveSummary]]:
     """Solve landmarks and frame scales under frozen cameras; return the state, the noise and the solves.
 
@@ -247,7 +248,7 @@ def refine_structure(
     solves = []
     for _ in range(2):
         problem = structure_problem(state, observations, noise, config)
-        state, summary = run(Stage("structure", problem, config.structure_solver), state, hooks)
+        state, summary = run(Stage(kind, problem, config.structure_solver), state, hooks)
         solves.append(summary)
         noise = measure_noise(state, observations, noise, config)
     return state, noise, solves

@@ -98,17 +98,23 @@ def nonrigid_problem(
     """
     problem = Problem.over(state)
     problem.add(_data_terms(observations, rows, cameras, noise, config, energy))
+    return problem.add(motion_terms(mesh, config, energy))
+
+
+def motion_terms(mesh: PointMesh, config: NonRigidConfig, energy: Energy = MAP) -> list[FactorBatch]:
+    """Return E_motion: temporal smoothness and ARAP, where they are switched on."""
+    terms = []
     steps = mesh.consecutive(config.smoothness_order + 1, observed_only=not config.bridge_gaps)
     count = len(steps[0])
     if config.smoothness_weight > 0 and count:
         smoothness = velocity_smoothness if config.smoothness_order == 1 else acceleration_smoothness
         sigma, weight, kernel = config.smoothness_sigma_m, config.smoothness_weight, config.smoothness_kernel
-        problem.add(smoothness(*steps, **energy.linked(sigma, weight, kernel, count)))
+        terms.append(smoothness(*steps, **energy.linked(sigma, weight, kernel, count)))
     links = mesh.linked(observed_only=not config.bridge_gaps)
     count = len(links[0])
     if config.arap_weight > 0 and count:
-        problem.add(arap(*links, **energy.linked(config.arap_sigma_m, config.arap_weight, config.arap_kernel, count)))
-    return problem
+        terms.append(arap(*links, **energy.linked(config.arap_sigma_m, config.arap_weight, config.arap_kernel, count)))
+    return terms
 
 
 def _schedules(config: NonRigidConfig) -> tuple[tuple[Round, ...], ...]:
