@@ -16,10 +16,10 @@ import numpy as np
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npz, save_npz, write_failure
+from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry.se3 import orthonormalize
+from uni4d_fg.geometry.trajectory import Trajectory
 from uni4d_fg.pipeline.stream_checkpoint import restore, result_arrays, results_of, state_arrays
-from uni4d_fg.results.evaluate.trajectory import Trajectory
-from uni4d_fg.results.evaluate.tum import write_tum
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FinishedFrame, Landmarks
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_path
-from uni4d_fg.results.evaluate.trajectory import Trajectory
+from uni4d_fg.geometry.trajectory import Trajectory
 
 TUM_FORMAT = "timestamp tx ty tz qx qy qz qw"
 KITTI_FORMAT = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
