@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from uni4d_fg.cues.plan import CuePlan, CueReport
     from uni4d_fg.frontend.sequence.model import Sequence, Video
     from uni4d_fg.pipeline import RunSummary
+    from uni4d_fg.pipeline.measurements import MeasurementFiles
 
 
 def reconstruct(
@@ -45,6 +46,9 @@ def reconstruct(
     tracks: options.TrackFiles = None,
     track_model: options.TrackModel = None,
     intrinsics: options.IntrinsicsFile = None,
+    odometry: options.OdometryFile = None,
+    gps: options.GpsFile = None,
+    relative_poses: options.RelativePosesFile = None,
     layout: options.Layout = LayoutChoice.auto,
     depth_gt_scale: options.DepthScale = 1000.0,
     known_intrinsics: options.KnownIntrinsics = False,
@@ -57,6 +61,7 @@ def reconstruct(
     motion, tracks by a network or the built-in tracker.
     """
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.pipeline.measurements import MeasurementFiles
 
     chosen = [] if solver is None else [f"solver={solver.value}"]
     chosen += [] if window is None else [f"windows.frames={window}"]
@@ -76,7 +81,8 @@ def reconstruct(
     sequence, report = run_cues(opened.video, plan, run, settings, quiet=quiet)
     if report is not None and report.settings is not None:
         settings = report.settings
-    summary = run_pipeline(sequence, run, settings, resume=resume, quiet=quiet, cues=report)
+    files = MeasurementFiles(odometry, gps, relative_poses)
+    summary = run_pipeline(sequence, run, settings, resume=resume, quiet=quiet, cues=report, measurements=files)
     if json:
         print_json(summary.to_dict())
     else:
@@ -148,8 +154,9 @@ def class_list(classes: str | None) -> tuple[str, ...] | None:
 
 
 def run_pipeline(
-    sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None
-) -> RunSummary:
+    sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None,
+    measurements: MeasurementFiles | None = None,
+) -> RunSummary:  # fmt: skip
     """Reconstruct with progress; Ctrl-C ends the run cleanly and says how to go on.
 
     Raises:
@@ -161,7 +168,7 @@ def run_pipeline(
         try:
             return reconstruct_sequence(
                 sequence, run, config, resume=resume, reporter=reporter, should_stop=stop,
-                cues=None if cues is None else cues.to_dict(),
+                cues=None if cues is None else cues.to_dict(), measurements=measurements,
             )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"finished stages are kept in {run}; continue with: {resume_command()}") from error

@@ -2,6 +2,8 @@ r"""Priors that anchor what the images leave free.
 
 intrinsics   r = K - K_0                                [px], 4-vector
 log-scale    r = s_t - s_0                              [dimensionless], 1-vector
+deviation    r = s_t - s                                [dimensionless], 1-vector: of a frame's log-scale from that
+which all frames share, where other measurements than the cue know lengths
 aspect       r = log(fx / fy) - log(fx_0 / fy_0)        [dimensionless], 1-vector: the shape of a pixel
 scale        r = log(|c_a - c_b| / distance)            [dimensionless], 1-vector: fixes the scale of a
 reconstruction that no depth prior holds
@@ -16,7 +18,7 @@ import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
 from uni4d_fg.factors.factor_type import NativeRow, factor
-from uni4d_fg.factors.variable_types import CALIBRATION_COLUMNS, INTRINSICS, LOG_SCALE, POSE, calibration
+from uni4d_fg.factors.variable_types import CALIBRATION_COLUMNS, CUE_SCALE, INTRINSICS, LOG_SCALE, POSE, calibration
 
 _MIN_DISTANCE = 1e-9
 _LOOSE = 1e9
@@ -59,6 +61,28 @@ def log_scale_prior(log_scale: Array, *, measured: Array) -> Array:
 
 intrinsics_prior.jacobian(difference_jacobian)
 log_scale_prior.jacobian(difference_jacobian)
+
+
+@factor(CUE_SCALE, data={"measured": 1}, dim=1, native=native_log_scale)
+def cue_scale_prior(cue_scale: Array, *, measured: Array) -> Array:
+    """Return cue_scale - measured, (N, 1)."""
+    return cue_scale - measured
+
+
+cue_scale_prior.jacobian(difference_jacobian)
+
+
+@factor(LOG_SCALE, CUE_SCALE, dim=1)
+def log_scale_deviation(log_scale: Array, cue_scale: Array) -> Array:
+    """Return log_scale - cue_scale, (N, 1)."""
+    return log_scale - cue_scale
+
+
+@log_scale_deviation.jacobian
+def log_scale_deviation_jacobian(log_scale: FloatArray, cue_scale: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the residual and its Jacobians (N, 1, 1)."""
+    one = np.ones((len(log_scale), 1, 1))
+    return log_scale - cue_scale, [one, -one]
 
 
 @factor(POSE, POSE, data={"distance": ()}, dim=1)

@@ -11,6 +11,8 @@
 | ``OBJECT_POINT`` | q(track) | (3,) in the object's frame, m | 3 |
 | ``VELOCITY`` | v(frame) | (3,) of the camera, world axes, m/s | 3 |
 | ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s] | 6 |
+| ``GPS_MAP`` | e(map) | (4, 4) ``map_T_world`` | 6: body-frame (omega [rad], v [m]) |
+| ``CUE_SCALE`` | c(cue) | (1,) log-scale that the depth cues of all frames share | 1 |
 """
 
 from __future__ import annotations
@@ -72,3 +74,5 @@ IMU_BIAS = VariableType(
     "imu_bias", "b", vector_space(6), label="IMU bias",
     to_gtsam=lambda value: gtsam.imuBias.ConstantBias(value[:3], value[3:]), from_gtsam=_at_bias,
 )  # fmt: skip
+GPS_MAP = pose_variable("gps_map", "e", ("map",), label="pose of the world on the GPS map")
+CUE_SCALE = VariableType("cue_scale", "c", vector_space(1), ("cue",), label="log-scale of the depth cue")

@@ -54,11 +54,18 @@ class Stage:
     """Which of several solves of a kind, such as the frames of a window."""
     schedules: tuple[tuple[Round, ...], ...] = ((Round(),),)
     """Ways to go: successive solves each, of which the last is exact. All start alike; the lowest end is kept."""
+    own_world: bool = False
+    """Its world begins at a camera of its own, not at the video's first, and metres there may be others."""
 
     @property
     def name(self) -> str:
         """Kind and part, for summaries and messages."""
         return f"{self.kind}[{self.part}]" if self.part else self.kind
+
+    @property
+    def solves_cameras(self) -> bool:
+        """Whether it finds the cameras from all that is known of them: bundle adjustment, and the join of windows."""
+        return self.kind in ("bundle_adjustment", "join")
 
     @property
     def reads_free_variables(self) -> bool:

@@ -14,6 +14,7 @@ from uni4d_fg.frontend.sequence import model
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.optim.added_factors import FactorSource
+from uni4d_fg.pipeline.measurements import MeasurementFiles
 from uni4d_fg.pipeline.run import reconstruct as reconstruct_sequence
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.io import load_reconstruction
@@ -28,6 +29,7 @@ def reconstruct(
     changes: Sequence[str] = (),
     *,
     additions: Iterable[FactorSource] = (),
+    measurements: MeasurementFiles | None = None,
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Reconstruction:
@@ -39,6 +41,7 @@ def reconstruct(
         config: A configuration, the name of a preset, or a YAML file; the default preset when None.
         changes: ``section.field=VALUE``, as ``--set`` of the command line; not with an opened configuration.
         additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`.
+        measurements: Files of odometry, GPS and relative poses, see ``docs/measurements.md``.
         resume: Take over stages of the folder whose input and configuration are the same.
         reporter: Progress.
 
@@ -67,5 +70,8 @@ def reconstruct(
             )
             settings = report.settings or settings
     cues = None if report is None else report.to_dict()
-    reconstruct_sequence(sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions)
+    reconstruct_sequence(
+        sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions,
+        measurements=measurements,
+    )  # fmt: skip
     return load_reconstruction(RunFolder(folder).reconstruction)

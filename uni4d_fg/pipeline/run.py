@@ -19,7 +19,7 @@ from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.labels import label_tracks
-from uni4d_fg.optim.added_factors import FactorSource, with_additions
+from uni4d_fg.optim.added_factors import FactorSource, fingerprints, with_additions
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem_io import save_stage_graph
 from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
@@ -31,6 +31,7 @@ from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import remove_graphs, write_graph_values
 from uni4d_fg.pipeline.leftovers import remove_leftovers
+from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
@@ -57,6 +58,8 @@ class _Run:
     should_stop: Callable[[], bool]
     summary: RunSummary
     recorder: RecordingRunner
+    sources: tuple[FactorSource, ...]
+    """What is added to the stages."""
 
     def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord]) -> Arrays:
         """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored."""
@@ -112,6 +115,7 @@ def reconstruct(
     should_stop: Callable[[], bool] | None = None,
     cues: dict[str, Any] | None = None,
     additions: Iterable[FactorSource] = (),
+    measurements: MeasurementFiles | None = None,
 ) -> RunSummary:
     """Reconstruct a sequence and write the run folder.
 
@@ -123,8 +127,10 @@ def reconstruct(
         reporter: Progress.
         should_stop: Polled often; True ends the run with :class:`Cancelled`, finished stages kept.
         cues: What was made of the cues, for the summary: ``sources``, ``facts``, ``warnings``, ``metric``.
-        additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`. They are
-            not part of what ``resume`` compares.
+        additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`. Of
+            them ``resume`` compares the fingerprints that they may have, see
+            :data:`~uni4d_fg.optim.added_factors.FactorSource`.
+        measurements: Files of odometry, GPS and relative poses that join bundle adjustment; ``resume`` compares them.
 
     Returns:
         The summary that is also written as ``summary.json``.
@@ -139,7 +145,9 @@ def reconstruct(
     """
     check_sequence(sequence)
     recorder = RecordingRunner(stage_runner(config))
-    run_stage = with_additions(recorder, tuple(additions))
+    measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
+    sources = (*additions, *measured.sources)
+    run_stage = with_additions(recorder, sources)
     windows = windows_of(config, sequence.num_frames)
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
@@ -152,11 +160,11 @@ def reconstruct(
         },
         solver_facts(config),
         cues=cues or {},
-        warnings=list((cues or {}).get("warnings", [])),
+        warnings=[*(cues or {}).get("warnings", []), *measured.warnings],
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder,
+        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder, sources,
     )  # fmt: skip
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
@@ -166,6 +174,7 @@ def reconstruct(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
     key, scene, motion = _stages(run, key, labelled, windows, run_stage)
+    summary.stages["bundle_adjustment"]["facts"] = [*summary.stages["bundle_adjustment"]["facts"], *measured.facts]
     key = stage_key(key, config.fusion)
     _fuse(run, key, labelled, scene, motion)
     reconstruction = assemble(sequence, labelled, scene, motion)
@@ -191,14 +200,14 @@ def _stages(
             sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
             run.reporter, run.should_stop,
         )  # fmt: skip
-        key = stage_key(key, config.bundle_adjustment, config.windows)
+        key = stage_key(key, config.bundle_adjustment, config.windows, *fingerprints(run.sources))
         before = key
         scene = run.step("bundle_adjustment", key, lambda hooks: scene_step(parts, before, hooks))
         key = stage_key(key, config.nonrigid, *_searched(config))
         after = key
         return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
-    key = stage_key(key, config.bundle_adjustment)
+    key = stage_key(key, config.bundle_adjustment, *fingerprints(run.sources))
     scene = run.step(
         "bundle_adjustment",
         key,

@@ -122,10 +122,3 @@ def larger_covariance(first: FloatArray, second: FloatArray) -> FloatArray:
     factor = root @ (axes * np.sqrt(np.maximum(values, 1.0)))
     result: FloatArray = factor @ factor.T
     return result
-
-
-def composed_covariance(reference: FloatArray, reference_T_cam: FloatArray, relative: FloatArray) -> FloatArray:
-    """Return the covariance of ``world_T_reference reference_T_cam`` from those of its two parts, (6, 6) each."""
-    back = se3.adjoint(se3.inverse(reference_T_cam))
-    result: FloatArray = back @ reference @ back.T + relative
-    return result

@@ -26,7 +26,7 @@ from uni4d_fg.slam.incremental.model import (
     FrameUpdate,
     Landmarks,
 )
-from uni4d_fg.slam.incremental.pose import FramePose, composed_covariance, locate, predict
+from uni4d_fg.slam.incremental.pose import FramePose, locate, predict
 from uni4d_fg.slam.incremental.results import Results, ResultsInMemory, assemble_results
 from uni4d_fg.slam.incremental.tracking import OnlineTracker
 from uni4d_fg.slam.incremental.window import CameraWindow, LeftLandmarks
@@ -327,7 +327,7 @@ class IncrementalReconstructor:
                 pending.timestamp,
                 pending.status,
                 pose,
-                covariance if own else composed_covariance(covariance, pending.keyframe_T_cam, pending.covariance),
+                covariance if own else se3.composed_covariance(covariance, pending.keyframe_T_cam, pending.covariance),
                 log_scale if own else pending.log_scale,
                 in_world(pending.dynamic, pose),
             )
@@ -348,7 +348,7 @@ class IncrementalReconstructor:
             newest = self.pending[-1]
             covariance = window.covariance[-1]
             if newest.status is FrameStatus.TRACKED:
-                covariance = composed_covariance(covariance, newest.keyframe_T_cam, newest.covariance)
+                covariance = se3.composed_covariance(covariance, newest.keyframe_T_cam, newest.covariance)
         return FrameUpdate(
             status, max(self.num_frames - 1, 0), self.last_pose, covariance, window.landmark_track, window.landmark,
             dynamic, finished, landmarks, window.error_px, used, len(window), dict(self._seconds),
