@@ -63,11 +63,6 @@ class Stage:
         return f"{self.kind}[{self.part}]" if self.part else self.kind
 
     @property
-    def solves_cameras(self) -> bool:
-        """Whether it finds the cameras from all that is known of them: bundle adjustment, and the join of windows."""
-        return self.kind in ("bundle_adjustment", "join")
-
-    @property
     def reads_free_variables(self) -> bool:
         """Whether any factor reads a variable that may move."""
         problem = self.problem

@@ -48,8 +48,8 @@ class GpsSource:
         return cls(positions, arm, config.gps_kernel, config.gps_min_spread, fingerprint)
 
     def __call__(self, stage: Stage, state: State) -> Addition | None:
-        """Join solves of cameras and landmarks in the video's world; None elsewhere."""
-        if not stage.solves_cameras or stage.own_world:
+        """Join bundle adjustment in the video's world; None elsewhere."""
+        if stage.kind != "bundle_adjustment" or stage.own_world:
             return None
         known = self.positions
         _, row, entry = np.intersect1d(state.numbers(POSE)[:, 0], known.frame, return_indices=True)

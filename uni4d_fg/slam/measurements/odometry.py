@@ -22,8 +22,8 @@ class OdometrySource:
     fingerprint: str = ""
 
     def __call__(self, stage: Stage, state: State) -> Addition | None:
-        """Join solves of cameras and landmarks; None elsewhere."""
-        if not stage.solves_cameras:
+        """Join bundle adjustment; None elsewhere."""
+        if stage.kind != "bundle_adjustment":
             return None
         _, entry, _ = np.intersect1d(self.odometry.frame, state.numbers(POSE)[:, 0], return_indices=True)
         factors = []

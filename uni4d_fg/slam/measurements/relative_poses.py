@@ -47,8 +47,8 @@ class RelativePoseSource:
         )
 
     def __call__(self, stage: Stage, state: State) -> Addition | None:
-        """Join solves of cameras and landmarks; None elsewhere."""
-        if not stage.solves_cameras:
+        """Join bundle adjustment; None elsewhere."""
+        if stage.kind != "bundle_adjustment":
             return None
         poses, frames = self.poses, state.numbers(POSE)[:, 0]
         here = np.flatnonzero(np.isin(poses.first, frames) & np.isin(poses.second, frames))
