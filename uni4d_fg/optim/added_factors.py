@@ -17,7 +17,7 @@ GTSAM's that read a frame or a track which the state does not list are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -78,6 +78,11 @@ class AddedValues:
         for variable in added:
             rows = zip(map(tuple, state.numbers(variable).tolist()), state[variable], strict=True)
             self.values.setdefault(variable, {}).update(rows)
+
+    def forget(self, variable: VariableType, numbers: Iterable[Numbers]) -> None:
+        """Drop the values under the given numbers."""
+        for number in numbers:
+            self.of(variable).pop(number, None)
 
     def of(self, variable: VariableType) -> dict[Numbers, FloatArray]:
         """Return the values of a type."""

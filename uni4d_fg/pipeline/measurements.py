@@ -6,12 +6,10 @@ import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.errors import InputError
-from uni4d_fg.frontend.measurements.gps import GpsPositions, read_gps
+from uni4d_fg.frontend.measurements.gps import read_gps
 from uni4d_fg.frontend.measurements.odometry import read_odometry
 from uni4d_fg.frontend.measurements.relative_poses import read_relative_poses
 from uni4d_fg.optim.added_factors import FactorSource
@@ -63,9 +61,10 @@ def read_measurements(files: MeasurementFiles, timestamps: FloatArray, config: M
         out.warnings.extend(warnings)
     if files.gps is not None:
         positions, warnings = read_gps(files.gps, timestamps, config)
-        out.sources.append(GpsSource.of(positions, config, _fingerprint("gps", files.gps, config)))
+        source = GpsSource.of(positions, config, _fingerprint("gps", files.gps, config))
+        out.sources.append(source)
         out.facts.append(f"GPS positions of {len(positions.frame)} of {count} frames from {files.gps.name}")
-        out.warnings.extend([*warnings, *_spread_warning(files.gps, positions, config)])
+        out.warnings.extend([*warnings, *_spread_warning(files.gps, source)])
     if files.relative_poses is not None:
         poses, warnings = read_relative_poses(files.relative_poses, count)
         key = _fingerprint("relative poses", files.relative_poses, config)
@@ -75,15 +74,13 @@ def read_measurements(files: MeasurementFiles, timestamps: FloatArray, config: M
     return out
 
 
-def _spread_warning(path: Path, positions: GpsPositions, config: MeasurementsConfig) -> list[str]:
+def _spread_warning(path: Path, source: GpsSource) -> list[str]:
     """Say so if GPS can never join."""
-    centered = positions.xyz - positions.xyz.mean(axis=0)
-    spread, sigma = float(np.sqrt((centered**2).sum(axis=1).mean())), float(np.median(positions.sigma))
-    if len(positions.frame) >= 2 and spread >= config.gps_min_spread * sigma:
+    if source.is_of_use:
         return []
     return [
-        f"{path.name} is not used: its {len(positions.frame)} positions are spread over {spread:.3g} m at a sigma of "
-        f"{sigma:.3g} m, which does not say how the map lies (measurements.gps_min_spread)"
+        f"{path.name} is not used: its {len(source.positions.frame)} positions lie so close together, for their "
+        "sigmas, that they do not say how the map lies (measurements.gps_min_spread)"
     ]
 
 

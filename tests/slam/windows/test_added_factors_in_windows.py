@@ -102,25 +102,25 @@ def test_a_native_factor_between_frames_of_the_video(
     first, last = pair
     asked = se3.inverse(alone.world_T_cam[first]) @ alone.world_T_cam[last]
     asked = asked @ se3.se3_exp(np.array([0.02, -0.01, 0.0, 0.03, 0.0, 0.02]))
-    noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
     factor = gtsam.BetweenFactorPose3(POSE.key(first), POSE.key(last), gtsam.Pose3(asked), noise)
 
     def source(stage: Stage, state: State) -> Addition | None:
-        return Addition([factor], is_metric=False) if stage.kind == "bundle_adjustment" else None
+        return Addition([factor]) if stage.kind == "bundle_adjustment" else None
 
     reconstruct(scene, tmp_path, settings(), additions=[source])
     found = load_reconstruction(tmp_path / "reconstruction.npz")
 
     def residual(poses: np.ndarray) -> float:
         step = se3.inverse(poses[first]) @ poses[last]
-        return float(np.linalg.norm(se3.se3_log(se3.inverse(asked) @ step)))
+        return float(np.linalg.norm(se3.se3_log((se3.inverse(asked) @ step)[None])))
 
     assert residual(alone.world_T_cam) > 0.03
     assert residual(found.world_T_cam) < 0.002
 
 
 def test_the_join_with_added_terms_is_the_dense_minimum(rng: np.random.Generator) -> None:
-    """Windows as random information, GPS as added factors: against finite-difference-free dense Gauss-Newton."""
+    """Windows as random information, GPS as added factors: no step from the end lowers the energy."""
     windows, count = [Window(0, 5), Window(3, 8)], 8
     poses = np.stack([se3.se3_exp(np.array([0.1, 0.2, -0.1, 0.5, 0.2, 0.1]) * t) for t in range(count)])
     cameras = Cameras(poses, np.array([100.0, 100.0, 50.0, 50.0]), np.zeros(count))

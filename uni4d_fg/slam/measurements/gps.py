@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.factors.gps_position import gps_position
@@ -47,18 +47,30 @@ class GpsSource:
         arm = np.array(config.gps_lever_arm_m, dtype=np.float64)
         return cls(positions, arm, config.gps_kernel, config.gps_min_spread, fingerprint)
 
+    @property
+    def is_of_use(self) -> bool:
+        """Whether all positions together are spread far enough."""
+        return self._tells(np.arange(len(self.positions.frame)))
+
+    def _tells(self, entry: IntArray) -> bool:
+        """Return whether some of the positions are spread far enough."""
+        if len(entry) < 2:
+            return False
+        xyz, sigma = self.positions.xyz[entry], self.positions.sigma[entry]
+        spread = np.sqrt(((xyz - xyz.mean(axis=0)) ** 2).sum(axis=1).mean())
+        return bool(spread >= self.min_spread * np.median(sigma))
+
     def __call__(self, stage: Stage, state: State) -> Addition | None:
         """Join bundle adjustment in the video's world; None elsewhere."""
         if stage.kind != "bundle_adjustment" or stage.own_world:
             return None
         known = self.positions
+        if not self.is_of_use:
+            return None
         _, row, entry = np.intersect1d(state.numbers(POSE)[:, 0], known.frame, return_indices=True)
-        if len(row) < 2:
-            return None
+        if not self._tells(entry):  # it will later in the stream: until then nothing else shall settle the scale
+            return Addition([])
         xyz, sigma = known.xyz[entry], known.sigma[entry]
-        spread = np.sqrt(((xyz - xyz.mean(axis=0)) ** 2).sum(axis=1).mean())
-        if spread < self.min_spread * np.median(sigma):
-            return None
         arms = np.broadcast_to(self.lever_arm, (len(row), 3))
         found = align_points(camera_to_world(state[POSE][row], arms), xyz, with_scale=False)
         start = np.eye(4)

@@ -133,7 +133,7 @@ class AddedTerms:
 
 
 def added_terms(run: AddingRunner, cameras: Cameras, config: Config) -> AddedTerms:
-    """Ask the sources of a run for the join, part 'join' of bundle adjustment: its state is the cameras of all frames, without landmarks.
+    """Ask the sources of a run for the join, part 'join' of bundle adjustment: the cameras of all frames, no landmarks.
 
     The priors on the frames' log-scales are among the terms; the windows must not have them.
 
