@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from measurement_samples import scale_error, scene, settings, truth
 
+from uni4d_fg.config.load import load_config
 from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.config.solver import KernelConfig, SolverConfig
 from uni4d_fg.errors import ConfigError
@@ -180,3 +181,11 @@ def test_a_sequence_without_times_says_so(tmp_path: Path) -> None:
     given = files(tmp_path)["odometry"]
     with pytest.raises(Exception, match="the same clock"):
         reconstruct(sequence, tmp_path / "run", settings(), measurements=given)
+
+
+def test_odometry_sets_the_scale_of_a_solve_without_depth_prior(tmp_path: Path) -> None:
+    """Energy 'paper' anchors the distance of two cameras: that is loosened."""
+    overrides = ("output.clouds=false", "output.pictures=false", *samples.PRECISE)
+    reconstruct(scene(), tmp_path, load_config("paper", overrides), measurements=files(tmp_path)["odometry"])
+    found = load_reconstruction(tmp_path / "reconstruction.npz")
+    assert scale_error(found.world_T_cam, scene()) < 0.01
