@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import gtsam
@@ -16,6 +17,7 @@ from uni4d_fg.factors import State, factor
 from uni4d_fg.factors.gps_position import gps_position
 from uni4d_fg.factors.variable_types import GPS_MAP, POSE, VELOCITY
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
+from uni4d_fg.frontend.sequence.write import write_native
 from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.alignment import align_trajectories
@@ -138,7 +140,7 @@ def with_wrong_depth(sequence: Sequence) -> Sequence:
 
 @pytest.fixture(scope="module")
 def sequence() -> Sequence:
-    return with_wrong_depth(stream(28))
+    return with_wrong_depth(stream(28, grid_columns=15, grid_rows=11))
 
 
 @pytest.fixture(scope="module")
@@ -221,3 +223,15 @@ def test_a_stream_with_measurements_goes_on_bit_by_bit(sequence: Sequence, odome
     np.testing.assert_array_equal(whole.world_T_cam, cut.world_T_cam)
     with pytest.raises(InputError, match="another configuration, sequence or measurements"):
         stream_sequence(sequence, tmp_path / "cut", config, resume=True)
+
+
+def test_the_command_line_takes_the_files(
+    sequence: Sequence, odometry: Path, tmp_path: Path, cli: Callable[..., tuple[int, str, str]]
+) -> None:
+    write_native(sequence, tmp_path / "seq")
+    sets = [word for change in PRECISE for word in ("--set", change)]
+    code, out, _ = cli("stream", tmp_path / "seq", "--out", tmp_path / "run", "-q", "--odometry", odometry, *sets)
+    assert code == 0
+    assert "odometry of 28 of 28 frames from o.tum" in out
+    found = load_reconstruction(tmp_path / "run" / "reconstruction.npz")
+    assert abs(scale(found.world_T_cam, sequence) - 1.0) < 0.02

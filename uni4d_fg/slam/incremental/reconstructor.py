@@ -239,7 +239,9 @@ class IncrementalReconstructor:
             static.label[usable], static.rejected,
         )  # fmt: skip
         guesses = [self._predicted(frame), self.last_pose]
-        found = locate(guesses, chosen, points[usable], window.intrinsics, window.noise, self.config, self._run)
+        found = locate(
+            guesses, chosen, points[usable], window.intrinsics, window.noise, self.config, self._run, window.cue_scale
+        )
         count = int(found.inlier.sum())
         if count < self.config.incremental.min_tracks:
             return None, count

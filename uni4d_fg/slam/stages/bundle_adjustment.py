@@ -129,9 +129,14 @@ def reprojection_term(
 
 
 def depth_prior_terms(
-    observations: Observations, row: IntArray, sigma: float, num_frames: int, config: BundleAdjustmentConfig
+    observations: Observations,
+    row: IntArray,
+    sigma: float,
+    num_frames: int,
+    config: BundleAdjustmentConfig,
+    log_scale: float = 0.0,
 ) -> list[FactorBatch]:
-    """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales."""
+    """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales about one."""
     known = np.isfinite(observations.depth)
     seen = observations.select(known)
     return [
@@ -140,7 +145,7 @@ def depth_prior_terms(
             depth=seen.depth, sigma=sigma, weight=seen.weight, kernel=kernel_of(config.depth_kernel),
         ),
         log_scale_prior(
-            np.arange(num_frames), measured=np.zeros((num_frames, 1)), sigma=config.depth_scale_prior_sigma
+            np.arange(num_frames), measured=np.full((num_frames, 1), log_scale), sigma=config.depth_scale_prior_sigma
         ),
     ]  # fmt: skip
 
