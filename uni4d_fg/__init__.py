@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from uni4d_fg.optim.problem import Problem
     from uni4d_fg.optim.solve import marginals, solve
     from uni4d_fg.pipeline.api import reconstruct
+    from uni4d_fg.pipeline.measurements import MeasurementFiles
     from uni4d_fg.results.evaluate.run import evaluate_run
     from uni4d_fg.results.export.run import export_run
     from uni4d_fg.results.graph_summary import stage_graphs
@@ -36,6 +37,7 @@ _HOMES = {
     "Addition": "uni4d_fg.optim.added_factors",
     "IncrementalReconstructor": "uni4d_fg.slam.incremental",
     "Kernel": "uni4d_fg.factors.kernels",
+    "MeasurementFiles": "uni4d_fg.pipeline.measurements",
     "Problem": "uni4d_fg.optim.problem",
     "State": "uni4d_fg.factors.state",
     "VariableType": "uni4d_fg.factors.variable",
@@ -56,6 +58,7 @@ __all__ = [
     "Addition",
     "IncrementalReconstructor",
     "Kernel",
+    "MeasurementFiles",
     "Problem",
     "State",
     "VariableType",

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from uni4d_fg.config.solver import SolverConfig
-from uni4d_fg.factors.priors import log_scale_about_common, log_scale_prior
+from uni4d_fg.factors.priors import log_scale_deviation, log_scale_prior
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable_types import COMMON_LOG_SCALE, LOG_SCALE
-from uni4d_fg.optim.added_factors import HOLDS_SCALE, AddingRunner, Addition, as_solved
+from uni4d_fg.factors.variable_types import CUE_SCALE, LOG_SCALE
+from uni4d_fg.optim.added_factors import HOLDS_SCALE, AddingRunner, Addition, adding_to, joined_by
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 
@@ -32,15 +32,15 @@ def test_a_replaced_term_is_gone_and_what_replaces_it_is_not() -> None:
     declared, state = stage()
 
     def source(_: Stage, now: State) -> Addition:
-        common = log_scale_about_common([0, 1, 2], 0, sigma=0.05)
-        pull = log_scale_about_common([0], 0, sigma=1e3)
-        return Addition([common, pull], {COMMON_LOG_SCALE: np.full((1, 1), 0.6)}, replaces=[log_scale_prior])
+        common = log_scale_deviation([0, 1, 2], 0, sigma=0.05)
+        pull = log_scale_deviation([0], 0, sigma=1e3)
+        return Addition([common, pull], {CUE_SCALE: np.full((1, 1), 0.6)}, replaces=[log_scale_prior])
 
     runner = AddingRunner(run_stage, [source])
     solved, summary = runner(declared, state)
-    assert set(summary.final_energies) == {"log_scale_about_common"}
-    np.testing.assert_allclose(solved[LOG_SCALE], runner.known[COMMON_LOG_SCALE][(0,)][0], atol=1e-6)
-    assert COMMON_LOG_SCALE not in solved
+    assert set(summary.final_energies) == {"log_scale_deviation"}
+    np.testing.assert_allclose(solved[LOG_SCALE], runner.known.of(CUE_SCALE)[(0,)][0], atol=1e-6)
+    assert CUE_SCALE not in solved
     assert summary.notes[HOLDS_SCALE]
     assert set(declared.problem.energies(state)) == {"log_scale_prior"}  # the stage itself is as it was
 
@@ -54,7 +54,7 @@ def test_replacing_spares_what_sources_add() -> None:
 
 def test_without_replacement_both_count() -> None:
     declared, state = stage()
-    solved, _ = AddingRunner(run_stage, [lambda _, __: Addition(observed())])(declared, state)
+    solved, _ = AddingRunner(run_stage, [lambda _, __: Addition(observed(), is_metric=False)])(declared, state)
     assert np.abs(solved[LOG_SCALE]).max() == pytest.approx(0.7 / 101.0, rel=1e-3)
 
 
@@ -62,14 +62,15 @@ def test_a_stage_as_it_was_solved_has_what_every_source_added() -> None:
     declared, state = stage()
 
     def common(_: Stage, now: State) -> Addition:
-        factors = [log_scale_about_common([0, 1, 2], 0, sigma=0.05)]
-        return Addition(factors, {COMMON_LOG_SCALE: np.zeros((1, 1))}, replaces=[log_scale_prior])
+        factors = [log_scale_deviation([0, 1, 2], 0, sigma=0.05)]
+        return Addition(factors, {CUE_SCALE: np.zeros((1, 1))}, replaces=[log_scale_prior])
 
     inner = AddingRunner(run_stage, [lambda _, __: Addition(observed(), is_metric=False)])
-    runner = AddingRunner(inner, [common])
+    runner = adding_to(inner, [common])
     solved, _ = runner(declared, state)
-    whole, joined = as_solved(runner, declared, solved)
-    assert {batch.name for batch in whole.problem.batches} == {"log_scale_about_common", "log_scale_prior"}
-    np.testing.assert_allclose(joined[COMMON_LOG_SCALE], 0.6, atol=1e-6)
-    np.testing.assert_allclose(joined[LOG_SCALE], solved[LOG_SCALE])
-    assert as_solved(run_stage, declared, state) == (declared, state)
+    whole = joined_by(runner, declared, solved)
+    assert {batch.name for batch in whole.stage.problem.batches} == {"log_scale_deviation", "log_scale_prior"}
+    np.testing.assert_allclose(whole.state[CUE_SCALE], 0.6, atol=1e-6)
+    np.testing.assert_allclose(whole.state[LOG_SCALE], solved[LOG_SCALE])
+    alone = joined_by(run_stage, declared, state)
+    assert (alone.stage, alone.state) == (declared, state)

@@ -16,9 +16,9 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
 from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.trajectory_files import read_tum
 from uni4d_fg.pipeline import RunSummary, reconstruct
 from uni4d_fg.results.depth_store import read_depth
-from uni4d_fg.results.evaluate.tum import read_tum
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.labels_io import load_labels
 from uni4d_fg.results.run_folder import RunFolder

@@ -75,7 +75,7 @@ def test_a_run_with_an_imu_is_metric_and_bridges_the_blackout(tmp_path: Path) ->
     assert np.degrees(np.arccos(np.dot(part["gravity"], expected) / 9.81**2)) < 1.5
     solves = summary["stages"]["bundle_adjustment"]["solves"]
     terms = set(solves[-3]["final_energies"])
-    assert {"CombinedImuFactorWithGravityVector", "gravity_magnitude", "log_scale_about_common"} <= terms
+    assert {"CombinedImuFactorWithGravityVector", "gravity_magnitude", "log_scale_deviation"} <= terms
     assert not {"camera_translation", "camera_rotation", "log_scale_prior"} & terms
     # The same samples resume; others do not.
     _, again = run(tmp_path / "imu", imu, resume=True)

@@ -20,9 +20,9 @@ from uni4d_fg.cli.main import app
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.write import write_native
+from uni4d_fg.frontend.trajectory_files import read_tum
 from uni4d_fg.pipeline.stream import stream_sequence
 from uni4d_fg.pipeline.stream_checkpoint import restore, state_arrays
-from uni4d_fg.results.evaluate.tum import read_tum
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.slam.incremental import IncrementalReconstructor
 

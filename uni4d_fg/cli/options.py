@@ -71,6 +71,14 @@ Imu = Annotated[
         show_default=False,
     ),
 ]  # fmt: skip
+OdometryFile = Annotated[
+    Path | None,
+    typer.Option("--odometry", help="Odometry: TUM trajectory, with sigmas or without.", show_default=False),
+]
+GpsFile = Annotated[Path | None, typer.Option("--gps", help="GPS positions: CSV.", show_default=False)]
+RelativePosesFile = Annotated[
+    Path | None, typer.Option("--relative-poses", help="Known relative poses of frames: g2o.", show_default=False)
+]
 Start = Annotated[int, typer.Option(help="First frame.")]
 Stop = Annotated[int | None, typer.Option(help="First frame that is left out.", show_default=False)]
 Stride = Annotated[int, typer.Option(help="Take every so many frames.")]

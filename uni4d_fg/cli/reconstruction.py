@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from uni4d_fg.frontend.measurements.imu import ImuSamples
     from uni4d_fg.frontend.sequence.model import Sequence, Video
     from uni4d_fg.pipeline import RunSummary
+    from uni4d_fg.pipeline.measurements import MeasurementFiles
 
 
 def reconstruct(
@@ -47,6 +48,9 @@ def reconstruct(
     track_model: options.TrackModel = None,
     intrinsics: options.IntrinsicsFile = None,
     imu: options.Imu = None,
+    odometry: options.OdometryFile = None,
+    gps: options.GpsFile = None,
+    relative_poses: options.RelativePosesFile = None,
     layout: options.Layout = LayoutChoice.auto,
     depth_gt_scale: options.DepthScale = 1000.0,
     known_intrinsics: options.KnownIntrinsics = False,
@@ -61,6 +65,7 @@ def reconstruct(
     from uni4d_fg.config.load import load_config
     from uni4d_fg.frontend.measurements.imu import read_imu
     from uni4d_fg.pipeline.inertial import check_goes_with_imu
+    from uni4d_fg.pipeline.measurements import MeasurementFiles
     from uni4d_fg.slam.windows.plan import windows_of
 
     chosen = [] if solver is None else [f"solver={solver.value}"]
@@ -85,7 +90,10 @@ def reconstruct(
     sequence, report = run_cues(opened.video, plan, run, settings, quiet=quiet)
     if report is not None and report.settings is not None:
         settings = report.settings
-    summary = run_pipeline(sequence, run, settings, resume=resume, quiet=quiet, cues=report, imu=samples)
+    files = MeasurementFiles(odometry, gps, relative_poses)
+    summary = run_pipeline(
+        sequence, run, settings, resume=resume, quiet=quiet, cues=report, measurements=files, imu=samples
+    )
     if json:
         print_json(summary.to_dict())
     else:
@@ -159,6 +167,7 @@ def class_list(classes: str | None) -> tuple[str, ...] | None:
 def run_pipeline(
     sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None,
     imu: ImuSamples | None = None,
+    measurements: MeasurementFiles | None = None,
 ) -> RunSummary:  # fmt: skip
     """Reconstruct with progress; Ctrl-C ends the run cleanly and says how to go on.
 
@@ -171,7 +180,7 @@ def run_pipeline(
         try:
             return reconstruct_sequence(
                 sequence, run, config, resume=resume, reporter=reporter, should_stop=stop,
-                cues=None if cues is None else cues.to_dict(), imu=imu,
+                cues=None if cues is None else cues.to_dict(), measurements=measurements, imu=imu,
             )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"finished stages are kept in {run}; continue with: {resume_command()}") from error

@@ -42,11 +42,15 @@ def stream(
     tracks: options.TrackFiles = None,
     intrinsics: options.IntrinsicsFile = None,
     known_intrinsics: options.KnownIntrinsics = False,
+    odometry: options.OdometryFile = None,
+    gps: options.GpsFile = None,
+    relative_poses: options.RelativePosesFile = None,
     quiet: options.Quiet = False,
     json: options.Json = False,
 ) -> None:
     """Reconstruct frame by frame over a sliding window: cameras, static and moving points of a video of any length."""
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.pipeline.measurements import MeasurementFiles
     from uni4d_fg.pipeline.stream import stream_sequence
 
     settings = load_config(config, changes or ())
@@ -72,8 +76,9 @@ def stream(
         reporter.begin("stream", sequence.num_frames)
         try:
             summary = stream_sequence(
-                sequence, run, settings, resume=resume, on_frame=_LiveProgress(reporter), should_stop=interrupted
-            )
+                sequence, run, settings, resume=resume, on_frame=_LiveProgress(reporter), should_stop=interrupted,
+                measurements=MeasurementFiles(odometry, gps, relative_poses),
+            )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"{error}: results so far are in {run}; continue with: {resume_command()}") from error
         reporter.end()

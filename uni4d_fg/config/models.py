@@ -14,6 +14,7 @@ from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
 from uni4d_fg.config.geometric_depth import AffineDepthConfig, GeometricDepthConfig
 from uni4d_fg.config.imu import ImuConfig
 from uni4d_fg.config.incremental import IncrementalConfig
+from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
@@ -72,6 +73,7 @@ class Config(Section):
         IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.", basic=True
     )
     fusion: FusionConfig = setting(FusionConfig(), "Fusion.", basic=True)
+    measurements: MeasurementsConfig = setting(MeasurementsConfig(), "Odometry, GPS and relative poses from files.")
     networks: NetworkConfig = setting(NetworkConfig(), "Networks that make cues.", basic=True)
     geometric_depth: GeometricDepthConfig = setting(
         GeometricDepthConfig(), "Depth from camera motion alone.", basic=True

@@ -2,6 +2,8 @@ r"""Priors that anchor what the images leave free.
 
 intrinsics   r = K - K_0                                [px], 4-vector
 log-scale    r = s_t - s_0                              [dimensionless], 1-vector
+deviation    r = s_t - s                                [dimensionless], 1-vector: of a frame's log-scale from that
+which all frames share, where other measurements than the cue know lengths
 aspect       r = log(fx / fy) - log(fx_0 / fy_0)        [dimensionless], 1-vector: the shape of a pixel
 scale        r = log(|c_a - c_b| / distance)            [dimensionless], 1-vector: fixes the scale of a
 reconstruction that no depth prior holds
@@ -20,7 +22,7 @@ from uni4d_fg.arrays import Array, FloatArray, namespace
 from uni4d_fg.factors.factor_type import NativeRow, factor
 from uni4d_fg.factors.variable_types import (
     CALIBRATION_COLUMNS,
-    COMMON_LOG_SCALE,
+    CUE_SCALE,
     GRAVITY,
     INTRINSICS,
     LOG_SCALE,
@@ -71,6 +73,28 @@ intrinsics_prior.jacobian(difference_jacobian)
 log_scale_prior.jacobian(difference_jacobian)
 
 
+@factor(CUE_SCALE, data={"measured": 1}, dim=1, native=native_log_scale)
+def cue_scale_prior(cue_scale: Array, *, measured: Array) -> Array:
+    """Return cue_scale - measured, (N, 1)."""
+    return cue_scale - measured
+
+
+cue_scale_prior.jacobian(difference_jacobian)
+
+
+@factor(LOG_SCALE, CUE_SCALE, dim=1)
+def log_scale_deviation(log_scale: Array, cue_scale: Array) -> Array:
+    """Return log_scale - cue_scale, (N, 1)."""
+    return log_scale - cue_scale
+
+
+@log_scale_deviation.jacobian
+def log_scale_deviation_jacobian(log_scale: FloatArray, cue_scale: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the residual and its Jacobians (N, 1, 1)."""
+    one = np.ones((len(log_scale), 1, 1))
+    return log_scale - cue_scale, [one, -one]
+
+
 @factor(POSE, POSE, data={"distance": ()}, dim=1)
 def scale_anchor(first: Array, second: Array, *, distance: Array) -> Array:
     """Return (N, 1) of two poses (N, 4, 4) and the distance of their centres (N,), m."""
@@ -108,19 +132,6 @@ def aspect_prior_jacobian(intrinsics: FloatArray, *, measured: FloatArray) -> tu
     jacobian[:, 0, 0] = 1.0 / intrinsics[:, 0]
     jacobian[:, 0, 1] = -1.0 / intrinsics[:, 1]
     return aspect_prior.residual(intrinsics, measured=measured), [jacobian]
-
-
-@factor(LOG_SCALE, COMMON_LOG_SCALE, dim=1)
-def log_scale_about_common(log_scale: Array, common: Array) -> Array:
-    """Return log_scale - common, (N, 1)."""
-    return log_scale - common
-
-
-@log_scale_about_common.jacobian
-def log_scale_about_common_jacobian(log_scale: FloatArray, common: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the residual and the Jacobians of both, each (N, 1, 1)."""
-    one = np.ones((len(log_scale), 1, 1))
-    return log_scale - common, [one, -one]
 
 
 @factor(GRAVITY, data={"magnitude": ()}, dim=1)

@@ -14,7 +14,8 @@
 | ``VELOCITY`` | v(frame) | (3,) of the camera, world axes, m/s | 3 |
 | ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s], camera axes | 6 |
 | ``GRAVITY`` | g(0) | (3,) acceleration of gravity, world axes, m/s^2 | 3 |
-| ``COMMON_LOG_SCALE`` | c(0) | (1,) what the log-scales of all frames have in common | 1 |
+| ``GPS_MAP`` | e(map) | (4, 4) ``map_T_world`` | 6: body-frame (omega [rad], v [m]) |
+| ``CUE_SCALE`` | c(cue) | (1,) log-scale that the depth cues of all frames share | 1 |
 """
 
 from __future__ import annotations
@@ -108,4 +109,5 @@ IMU_BIAS = VariableType(
     to_gtsam=lambda value: gtsam.imuBias.ConstantBias(value[:3], value[3:]), from_gtsam=_at_bias,
 )  # fmt: skip
 GRAVITY = point_variable("gravity", "g", ("",))
-COMMON_LOG_SCALE = VariableType("common_log_scale", "c", vector_space(1), ("",), "common depth log-scale")
+GPS_MAP = pose_variable("gps_map", "e", ("map",), label="pose of the world on the GPS map")
+CUE_SCALE = VariableType("cue_scale", "c", vector_space(1), ("cue",), label="log-scale of the depth cue")

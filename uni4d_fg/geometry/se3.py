@@ -248,3 +248,10 @@ def inverse_right_jacobian(twist: FloatArray) -> FloatArray:
         np.eye(6) + 0.5 * ad + alpha[:, None, None] * ad_squared + beta[:, None, None] * (ad_squared @ ad_squared)
     )
     return result
+
+
+def composed_covariance(reference: FloatArray, reference_T_cam: FloatArray, relative: FloatArray) -> FloatArray:
+    """Return the covariance of ``world_T_reference reference_T_cam`` from those of its two parts, (6, 6) each."""
+    back = adjoint(inverse(reference_T_cam))
+    result: FloatArray = back @ reference @ back.T + relative
+    return result

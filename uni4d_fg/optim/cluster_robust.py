@@ -128,7 +128,7 @@ def gradient_spread(
     for batch in batches:
         if len(batch) == 0 or any(s.variable == eliminate for s in batch.slots):
             continue
-        if batch.factor_type.name == MARGINALIZATION_PRIOR and carried is not None:
+        if batch.name == MARGINALIZATION_PRIOR and carried is not None:
             at = np.concatenate(
                 [layout.columns(s.variable, s.rows)[0] for s in batch.slots if s.variable in layout.offset]
             )

@@ -57,7 +57,7 @@ class Problem:
             SolverError: If a ``gtsam`` factor reads a key that the state does not have, or no state is given.
         """
         batches, native = [], []
-        for item in _flat(factors):
+        for item in flat_factors(factors):
             if isinstance(item, gtsam.NonlinearFactor):
                 native.append(item)
             else:
@@ -127,11 +127,12 @@ def all_free(state: State, *variables: VariableType) -> dict[VariableType, BoolA
     return {variable: np.ones((len(state[variable]), variable.dim), dtype=bool) for variable in variables}
 
 
-def _flat(items: Iterable[Any]) -> Iterable[Any]:
+def flat_factors(items: Iterable[Any]) -> Iterable[Any]:
+    """Yield the single batches and ``gtsam`` factors of nested iterables and graphs."""
     for item in items:
         if isinstance(item, gtsam.NonlinearFactorGraph):
             yield from (item.at(i) for i in range(item.size()) if item.at(i) is not None)
         elif isinstance(item, FactorBatch | gtsam.NonlinearFactor):
             yield item
         else:
-            yield from _flat(item)
+            yield from flat_factors(item)

@@ -54,6 +54,8 @@ class Stage:
     """Which of several solves of a kind, such as the frames of a window."""
     schedules: tuple[tuple[Round, ...], ...] = ((Round(),),)
     """Ways to go: successive solves each, of which the last is exact. All start alike; the lowest end is kept."""
+    own_world: bool = False
+    """Its world begins at a camera of its own, not at the video's first, and metres there may be others."""
 
     @property
     def name(self) -> str:

@@ -15,6 +15,7 @@ from uni4d_fg.frontend.sequence import model
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.optim.added_factors import FactorSource
+from uni4d_fg.pipeline.measurements import MeasurementFiles
 from uni4d_fg.pipeline.run import reconstruct as reconstruct_sequence
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.io import load_reconstruction
@@ -30,6 +31,7 @@ def reconstruct(
     *,
     additions: Iterable[FactorSource] = (),
     imu: ImuSamples | str | Path | None = None,
+    measurements: MeasurementFiles | None = None,
     resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Reconstruction:
@@ -43,6 +45,7 @@ def reconstruct(
         additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`.
         imu: Accelerometer and gyroscope on the clock of the frames: samples, a CSV file as EuRoC has it, or a folder
             with ``imu.csv`` and ``imu.yaml``.
+        measurements: Files of odometry, GPS and relative poses, see ``docs/measurements.md``.
         resume: Take over stages of the folder whose input and configuration are the same.
         reporter: Progress.
 
@@ -73,6 +76,7 @@ def reconstruct(
             settings = report.settings or settings
     cues = None if report is None else report.to_dict()
     reconstruct_sequence(
-        sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions, imu=samples
-    )
+        sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions,
+        measurements=measurements, imu=samples,
+    )  # fmt: skip
     return load_reconstruction(RunFolder(folder).reconstruction)

@@ -12,13 +12,13 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.geometry.trajectory import Trajectory
 from uni4d_fg.pipeline.leftovers import remove_views
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.clouds import write_clouds
 from uni4d_fg.results.depth_store import read_depth
-from uni4d_fg.results.evaluate.trajectory import Trajectory
-from uni4d_fg.results.evaluate.tum import write_tum
 from uni4d_fg.results.fusion.clouds import dynamic_cloud, dynamic_clouds, static_cloud
 from uni4d_fg.results.io import save_reconstruction
 from uni4d_fg.results.pictures import draw_depth_strip, draw_scene, draw_trajectory

@@ -10,7 +10,7 @@ import numpy as np
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_RELATIVE
 from uni4d_fg.errors import ConfigError
-from uni4d_fg.factors.variable_types import COMMON_LOG_SCALE, GRAVITY, IMU_BIAS
+from uni4d_fg.factors.variable_types import CUE_SCALE, GRAVITY, IMU_BIAS
 from uni4d_fg.optim.added_factors import AddingRunner
 from uni4d_fg.slam.measurements.imu_start import InertialStart
 
@@ -41,9 +41,9 @@ def metric_cues(cues: Mapping[str, Any]) -> dict[str, Any]:
 def imu_summary(start: InertialStart, runner: AddingRunner) -> dict[str, Any]:
     """Return what ``summary.json`` says of the IMU, from the alignment and the variables that were added."""
     aligned = start.alignment
-    known = {variable: np.array(list(values.values())) for variable, values in runner.known.items()}
+    known = {variable: np.array(list(values.values())) for variable, values in runner.known.values.items()}
     gravity, bias = known.get(GRAVITY, aligned.gravity[None])[0], known.get(IMU_BIAS, aligned.bias[None])
-    scale = known.get(COMMON_LOG_SCALE)
+    scale = known.get(CUE_SCALE)
     return {
         "aligned_scale": aligned.scale,
         "aligned_scale_sigma": aligned.scale_sigma,

@@ -20,7 +20,7 @@ from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.labels import label_tracks
-from uni4d_fg.optim.added_factors import FactorSource, with_additions
+from uni4d_fg.optim.added_factors import FactorSource, fingerprints, with_additions
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem_io import save_stage_graph
 from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
@@ -35,6 +35,7 @@ from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
+from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
@@ -61,6 +62,8 @@ class _Run:
     should_stop: Callable[[], bool]
     summary: RunSummary
     recorder: RecordingRunner
+    sources: tuple[FactorSource, ...]
+    """What is added to the stages."""
     imu: ImuSamples | None = None
 
     def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord]) -> Arrays:
@@ -118,6 +121,7 @@ def reconstruct(
     should_stop: Callable[[], bool] | None = None,
     cues: dict[str, Any] | None = None,
     additions: Iterable[FactorSource] = (),
+    measurements: MeasurementFiles | None = None,
     imu: ImuSamples | None = None,
 ) -> RunSummary:
     """Reconstruct a sequence and write the run folder.
@@ -130,8 +134,10 @@ def reconstruct(
         reporter: Progress.
         should_stop: Polled often; True ends the run with :class:`Cancelled`, finished stages kept.
         cues: What was made of the cues, for the summary: ``sources``, ``facts``, ``warnings``, ``metric``.
-        additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`. They are
-            not part of what ``resume`` compares.
+        additions: Factors and variables of your own for any stage, see :mod:`uni4d_fg.optim.added_factors`. Of
+            them ``resume`` compares the fingerprints that they may have, see
+            :data:`~uni4d_fg.optim.added_factors.FactorSource`.
+        measurements: Files of odometry, GPS and relative poses that join bundle adjustment; ``resume`` compares them.
         imu: Inertial measurements over all frames, on their clock, for stage 2.
 
     Returns:
@@ -149,7 +155,9 @@ def reconstruct(
     """
     check_sequence(sequence)
     recorder = RecordingRunner(stage_runner(config))
-    run_stage = with_additions(recorder, tuple(additions))
+    measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
+    sources = (*additions, *measured.sources)
+    run_stage = with_additions(recorder, sources)
     windows = windows_of(config, sequence.num_frames)
     if imu is not None:
         check_goes_with_imu(config, len(windows))
@@ -166,11 +174,11 @@ def reconstruct(
         },
         solver_facts(config),
         cues=cues or {},
-        warnings=list((cues or {}).get("warnings", [])),
+        warnings=[*(cues or {}).get("warnings", []), *measured.warnings],
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder, imu,
+        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder, sources, imu,
     )  # fmt: skip
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
@@ -181,6 +189,7 @@ def reconstruct(
     )
     key, camera = _camera(run, key, labelled)
     key, scene, motion = _stages(run, key, *camera.apply(sequence, labelled, config), windows, run_stage)
+    summary.stages["bundle_adjustment"]["facts"] = [*summary.stages["bundle_adjustment"]["facts"], *measured.facts]
     key = stage_key(key, config.fusion)
     _fuse(run, key, labelled, scene, motion)
     reconstruction = assemble(sequence, labelled, scene, motion, camera.lens)
@@ -231,15 +240,15 @@ def _stages(
             sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
             run.reporter, run.should_stop,
         )  # fmt: skip
-        key = stage_key(key, config.bundle_adjustment, config.windows)
+        key = stage_key(key, config.bundle_adjustment, config.windows, *fingerprints(run.sources))
         before = key
         scene = run.step("bundle_adjustment", key, lambda hooks: scene_step(parts, before, hooks))
         key = stage_key(key, config.nonrigid, *_searched(config))
         after = key
         return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
-    measured = [] if run.imu is None else [config.imu, run.imu.digest()]
-    key = stage_key(key, config.bundle_adjustment, *measured)
+    inertial = [] if run.imu is None else [config.imu, run.imu.digest()]
+    key = stage_key(key, config.bundle_adjustment, *inertial, *fingerprints(run.sources))
     scene = run.step(
         "bundle_adjustment",
         key,

@@ -19,7 +19,7 @@ from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
-from uni4d_fg.optim.added_factors import AddingRunner
+from uni4d_fg.optim.added_factors import adding_to
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
@@ -126,7 +126,7 @@ def _with_imu(
     prior = sequence.intrinsics
     first = start_with_imu(labelled, start, prior, freedom, sequence.timestamps, imu, config, hooks, run)
     stop_if_cancelled(first.solves)
-    adding = AddingRunner(run, [first.source])
+    adding = adding_to(run, [first.source])
     scene = StaticSceneSolver(config, adding, hooks).adjust(labelled, first.cameras, prior, freedom)
     stop_if_cancelled(scene.solves)
     summary = _scene_summary(sequence, replace(scene, solves=[*first.solves, *scene.solves]), config)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,11 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.pipeline.assemble import write_result
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.leftovers import remove_leftovers
+from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
 from uni4d_fg.results.run_folder import RunFolder
@@ -40,6 +42,9 @@ class StreamSummary:
     seconds: dict[str, float]
     """Of this process, per part and in all."""
     peak_memory_mb: float
+    facts: list[str] = field(default_factory=list)
+    """What measurements there were."""
+    measurement_warnings: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -53,7 +58,8 @@ class StreamSummary:
     def warnings(self) -> list[str]:
         """Return what to distrust."""
         bridged = self.counts.get(FrameStatus.BRIDGED.value, 0)
-        return [f"{bridged} frame(s) had too few static tracks and are bridged by constant velocity"] if bridged else []
+        text = f"{bridged} frame(s) had too few static tracks and are bridged by constant velocity"
+        return [*([text] if bridged else []), *self.measurement_warnings]
 
     def lines(self) -> list[str]:
         """Return a few lines of text."""
@@ -64,6 +70,7 @@ class StreamSummary:
         if self.resumed_from:
             out.append(f"resumed at frame {self.resumed_from}")
         out.append(f"{rate:.1f} frames a second, {self.peak_memory_mb:.0f} MB; {parts}")
+        out += self.facts
         return out + [f"warning: {text}" for text in self.warnings()]
 
 
@@ -75,6 +82,8 @@ def stream_sequence(
     resume: bool = False,
     on_frame: OnFrame | None = None,
     should_stop: Callable[[], bool] | None = None,
+    additions: Iterable[FactorSource] = (),
+    measurements: MeasurementFiles | None = None,
 ) -> StreamSummary:
     """Solve a sequence frame by frame; results are written as frames leave the window.
 
@@ -85,6 +94,8 @@ def stream_sequence(
         resume: Go on from the last checkpoint in ``run_dir`` if there is one.
         on_frame: Told of every frame.
         should_stop: Polled before every frame; True writes a checkpoint and ends with :class:`Cancelled`.
+        additions: Factors and variables of your own, see :mod:`uni4d_fg.optim.added_factors`.
+        measurements: Files of odometry, GPS and relative poses.
 
     Raises:
         InputError: If a cue cannot be read, or the checkpoint does not fit.
@@ -97,7 +108,9 @@ def stream_sequence(
     remove_leftovers(RunFolder(run_dir))
     folder = StreamFolder(run_dir)
     folder.remove_leftovers()
-    solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder)
+    measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
+    sources = (*additions, *measured.sources)
+    solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder, sources)
     resumed = folder.resume(solver, config) if resume else False
     if not resumed:
         RunFolder(run_dir).trajectory.unlink(missing_ok=True)
@@ -127,7 +140,9 @@ def stream_sequence(
     reconstruction = solver.finish()
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began
-    summary = StreamSummary(sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb())
+    summary = StreamSummary(
+        sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), measured.facts, measured.warnings
+    )
     atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
     return summary
 

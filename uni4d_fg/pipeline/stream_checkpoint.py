@@ -19,6 +19,7 @@ from uni4d_fg.factors.variable import variable_type
 from uni4d_fg.optim.cluster_robust import Spread
 from uni4d_fg.slam.incremental.model import DynamicPoints, FinishedFrame, FrameStatus, Landmarks
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor, PendingFrame
+from uni4d_fg.slam.incremental.window import KeyedPrior
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
@@ -45,11 +46,17 @@ def state_arrays(solver: IncrementalReconstructor) -> Arrays:
     out["window_error_px"] = np.array(window.error_px)
     out["window_prior_intrinsics"] = window.prior_intrinsics
     if window.prior is not None:
-        out |= {f"prior_{name}": array for name, array in window.prior.data.items()}
-        out["prior_variables"] = np.array([slot.variable.name for slot in window.prior.slots])
+        prior = window.prior.batch
+        out |= {f"prior_{name}": array for name, array in prior.data.items()}
+        out["prior_variables"] = np.array([slot.variable.name for slot in prior.slots])
         if window.spread is not None:
             out["prior_scores"], out["prior_rest"] = window.spread.scores, window.spread.rest
-        out["prior_rows"] = np.array([int(slot.rows[0]) for slot in window.prior.slots])
+        # The second number of types that have one only is a filler.
+        out["prior_numbers"] = np.array([(*n, 0)[:2] for n in window.prior.numbers], dtype=np.int64)
+    for variable, values in window.added.values.items():
+        if values:
+            out[f"added_{variable.name}_numbers"] = np.array(list(values), dtype=np.int64)
+            out[f"added_{variable.name}"] = np.stack(list(values.values()))
     out |= {f"dynamic_{name}": getattr(dynamic, name) for name in ("frame", "pose", "instance")}
     out |= {f"dynamic_observed_{name}": getattr(dynamic.observations, name) for name in _OBSERVATIONS}
     out["dynamic_depth_sigma"] = np.array(dynamic.depth_sigma)
@@ -93,12 +100,18 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
     if "prior_variables" in arrays:
         variables = tuple(variable_type(str(name)) for name in arrays["prior_variables"].tolist())
         prior_type = marginalization_prior_type(variables)
-        rows = arrays["prior_rows"].tolist()
-        slots = tuple(Slot(group, np.array([row])) for group, row in zip(variables, rows, strict=True))
+        slots = tuple(Slot(variable, np.zeros(1, dtype=np.int64)) for variable in variables)
+        numbers = zip(variables, arrays["prior_numbers"].tolist(), strict=True)
         data = {name: arrays[f"prior_{name}"] for name in prior_type.data}
-        window.prior = FactorBatch.create(prior_type, slots, data)
+        batch = FactorBatch.create(prior_type, slots, data)
+        window.prior = KeyedPrior(batch, tuple(tuple(row[: len(variable.index)]) for variable, row in numbers))
         if "prior_scores" in arrays:
             window.spread = Spread(arrays["prior_scores"], arrays["prior_rest"])
+    for name in arrays:
+        if name.startswith("added_") and name.endswith("_numbers"):
+            variable = variable_type(name.removeprefix("added_").removesuffix("_numbers"))
+            rows = map(tuple, arrays[name].tolist())
+            window.added.values[variable] = dict(zip(rows, arrays[f"added_{variable.name}"], strict=True))
     for name in ("frame", "pose", "instance"):
         setattr(dynamic, name, arrays[f"dynamic_{name}"])
     dynamic.observations = Observations(*(arrays[f"dynamic_observed_{name}"] for name in _OBSERVATIONS))

@@ -16,10 +16,11 @@ import numpy as np
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npz, save_npz, write_failure
+from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry.se3 import orthonormalize
+from uni4d_fg.geometry.trajectory import Trajectory
+from uni4d_fg.optim.added_factors import fingerprints
 from uni4d_fg.pipeline.stream_checkpoint import restore, result_arrays, results_of, state_arrays
-from uni4d_fg.results.evaluate.trajectory import Trajectory
-from uni4d_fg.results.evaluate.tum import write_tum
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FinishedFrame, Landmarks
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor
@@ -80,8 +81,8 @@ class StreamFolder:
         arrays = load_npz(self.checkpoint, {"key": None, "num_parts": None})
         if str(arrays.pop("key")) != _key(solver, config):
             raise InputError(
-                f"{self.checkpoint}: was written with another configuration or sequence; use those again, or start "
-                "anew with --overwrite"
+                f"{self.checkpoint}: was written with another configuration, sequence or measurements; use those "
+                "again, or start anew with --overwrite"
             )
         self.num_parts = int(arrays.pop("num_parts"))
         restore(solver, arrays)
@@ -151,4 +152,5 @@ class StreamFolder:
 def _key(solver: IncrementalReconstructor, config: Config) -> str:
     digest = hashlib.blake2b(config.model_dump_json(exclude={"output", "fusion"}).encode(), digest_size=16)
     digest.update(f"{solver.image_size} {solver.window.prior_intrinsics.tolist()}".encode())
+    digest.update("".join(fingerprints(solver.window.sources)).encode())
     return digest.hexdigest()

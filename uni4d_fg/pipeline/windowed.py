@@ -15,6 +15,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.optim.added_factors import AddingRunner
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.summary import SolveSummary, Termination
@@ -26,8 +27,10 @@ from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.progress import Reporter
 from uni4d_fg.slam.stages.bundle_adjustment import hold_metric_scale
 from uni4d_fg.slam.stages.scene import Cameras, unknown_covariances
+from uni4d_fg.slam.windows.added_terms import added_terms
 from uni4d_fg.slam.windows.join import Joined, chain, join
 from uni4d_fg.slam.windows.motion import join_motion
+from uni4d_fg.slam.windows.numbered import NumberedRunner
 from uni4d_fg.slam.windows.plan import TrackSpans, Window, blend_weight, tracks_in
 from uni4d_fg.slam.windows.scene import (
     WindowLandmarks,
@@ -130,9 +133,8 @@ def motion_step(windowed: WindowedRun, scene: Arrays, key: str, hooks: Hooks) ->
 
         def compute(window: Window = window) -> StageRecord:
             here = tracks_in(windowed.labelled, window.frames)
-            record = nonrigid_step(
-                here.labelled, _scene_part(scene, window, here.track), windowed.config, hooks, windowed.run
-            )
+            run = NumberedRunner(windowed.run, window.frames, here.track, own_world=False)
+            record = nonrigid_step(here.labelled, _scene_part(scene, window, here.track), windowed.config, hooks, run)
             arrays = {**record.arrays, "track": here.track[record.arrays["track"]]}
             return StageRecord(arrays, record.summary)
 
@@ -169,7 +171,7 @@ def _join(windowed: WindowedRun, scene_of: Callable[[int], WindowScene], intrins
     config, windows = windowed.config, windowed.windows
     spans = TrackSpans.of(windowed.labelled)
     cameras = chain(windows, [scene_of(i).cameras for i in range(len(windows))])
-    rounds = config.windows.rounds
+    rounds, adding = config.windows.rounds, isinstance(windowed.run, AddingRunner)
     for number in range(rounds):
         parts = []
         for index in range(len(windows)):
@@ -177,9 +179,15 @@ def _join(windowed: WindowedRun, scene_of: Callable[[int], WindowScene], intrins
             scene = scene_of(index)
             if number:
                 scene = place(scene, cameras, config.bundle_adjustment, windowed.run)
-            parts.append(information(owned(scene, spans, windows, index), windows, index, config))
-        joined = join(parts, cameras, intrinsics_covariance, covariance=number == rounds - 1)
-        cameras = Cameras.of(hold_metric_scale(joined.cameras.state(np.zeros((0, 3)))))
+            mine = owned(scene, spans, windows, index)
+            parts.append(information(mine, windows, index, config, log_scale_priors=not adding))
+        added = added_terms(windowed.run, cameras, config) if isinstance(windowed.run, AddingRunner) else None
+        joined = join(parts, cameras, intrinsics_covariance, covariance=number == rounds - 1, added=added)
+        cameras = joined.cameras
+        if added is not None:
+            added.keep(windowed.run)
+        if added is None or not added.is_metric:
+            cameras = Cameras.of(hold_metric_scale(cameras.state(np.zeros((0, 3)))))
     return replace(joined, cameras=cameras)
 
 

@@ -17,11 +17,11 @@ from uni4d_fg.errors import MissingDependencyError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.write import write_native
 from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.frontend.trajectory_files import read_tum
 from uni4d_fg.optim.summary import Termination
 from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.evaluate.run import evaluate_run
-from uni4d_fg.results.evaluate.tum import read_tum
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 

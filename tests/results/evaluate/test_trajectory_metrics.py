@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.errors import InputError
-from uni4d_fg.results.evaluate.trajectory import Trajectory, associate, evaluate_trajectory, path_length
-from uni4d_fg.results.evaluate.tum import read_kitti, read_tum
+from uni4d_fg.frontend.trajectory_files import read_kitti, read_tum
+from uni4d_fg.geometry.trajectory import Trajectory, associate
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory, path_length
 
 
 def evo_numbers(reference: PoseTrajectory3D, estimate: PoseTrajectory3D, scale: bool) -> np.ndarray:

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from uni4d_fg.results.evaluate.tum import read_kitti, write_kitti
+from uni4d_fg.frontend.trajectory_files import read_kitti, write_kitti
 from uni4d_fg.results.run import Run
 
 file_interface = pytest.importorskip("evo.tools.file_interface")

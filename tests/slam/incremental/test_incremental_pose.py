@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.geometry import se3
-from uni4d_fg.geometry.se3 import se3_log
-from uni4d_fg.slam.incremental.pose import composed_covariance, larger_covariance, predict
+from uni4d_fg.geometry.se3 import composed_covariance, se3_log
+from uni4d_fg.slam.incremental.pose import larger_covariance, predict
 
 
 def covariance_of(rng: np.random.Generator, size: int, scale: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.alignment import Degeneracy, Similarity, align_trajectories
@@ -16,38 +16,6 @@ from uni4d_fg.geometry.alignment import Degeneracy, Similarity, align_trajectori
 AlignmentMode: TypeAlias = Literal["sim3", "se3", "none"]
 
 _ALIGNMENT_NAMES = {"sim3": "Sim(3) Umeyama", "se3": "SE(3) Umeyama", "none": "no alignment"}
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Camera poses with their times.
-
-    Raises:
-        InputError: If the shapes disagree, there is no pose, or a value is not finite.
-    """
-
-    timestamps: FloatArray
-    """(T,) seconds, not decreasing."""
-    world_T_cam: FloatArray
-    """(T, 4, 4) camera to world, metres."""
-
-    def __post_init__(self) -> None:
-        count = len(self.timestamps)
-        if count == 0 or self.timestamps.shape != (count,) or self.world_T_cam.shape != (count, 4, 4):
-            raise InputError(
-                f"trajectory: timestamps {self.timestamps.shape} and poses {self.world_T_cam.shape} "
-                "must be (T,) and (T, 4, 4) with T > 0"
-            )
-        bad = np.flatnonzero(~(np.isfinite(self.world_T_cam).all(axis=(1, 2)) & np.isfinite(self.timestamps)))
-        if len(bad):
-            raise InputError(f"trajectory: pose {bad[0]} has a value that is NaN or infinite")
-
-    def __len__(self) -> int:
-        return len(self.timestamps)
-
-    def select(self, frames: IntArray) -> Trajectory:
-        """Return the poses at the given indices."""
-        return Trajectory(self.timestamps[frames], self.world_T_cam[frames])
 
 
 @dataclass(frozen=True)
@@ -81,35 +49,6 @@ class TrajectoryMetrics:
 def path_length(world_T_cam: FloatArray) -> float:
     """Return the length of the polyline through the camera centres of (T, 4, 4) poses, metres."""
     return float(np.linalg.norm(np.diff(world_T_cam[:, :3, 3], axis=0), axis=1).sum())
-
-
-def associate(
-    estimate: Trajectory, reference: Trajectory, *, tolerance_s: float = 0.01
-) -> tuple[Trajectory, Trajectory]:
-    """Pair poses by time: each pose of the shorter trajectory takes the nearest one of the longer.
-
-    Returns:
-        Both trajectories, reduced to the pairs whose times differ by no more than ``tolerance_s``.
-
-    Raises:
-        InputError: If no pair is that close.
-    """
-    swap = len(estimate) > len(reference)
-    short, long = (reference, estimate) if swap else (estimate, reference)
-    after = np.clip(np.searchsorted(long.timestamps, short.timestamps, side="right"), 0, len(long) - 1)
-    before = np.maximum(after - 1, 0)
-    ahead = np.abs(long.timestamps[after] - short.timestamps)
-    behind = np.abs(short.timestamps - long.timestamps[before])
-    nearest = np.where(ahead < behind, after, before)
-    close = np.flatnonzero(np.minimum(ahead, behind) <= tolerance_s)
-    if len(close) == 0:
-        raise InputError(
-            f"no two poses lie within {tolerance_s:g} s: the estimate covers "
-            f"{estimate.timestamps[0]:.3f} to {estimate.timestamps[-1]:.3f} s, the ground truth "
-            f"{reference.timestamps[0]:.3f} to {reference.timestamps[-1]:.3f} s"
-        )
-    pair = short.select(close), long.select(nearest[close])
-    return (pair[1], pair[0]) if swap else pair
 
 
 def evaluate_trajectory(

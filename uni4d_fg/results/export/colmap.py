@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from uni4d_fg.frontend.trajectory_files import continuous_quaternions
 from uni4d_fg.geometry.se3 import inverse
-from uni4d_fg.results.evaluate.tum import continuous_quaternions
 from uni4d_fg.results.export.colmap_files import ColmapModel, depth_map_bytes, write_binary, write_text
 from uni4d_fg.results.export.frames import write_images, write_masks
 from uni4d_fg.results.export.model import ExportJob

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from uni4d_fg.results.evaluate.trajectory import Trajectory
-from uni4d_fg.results.evaluate.tum import write_kitti, write_tum
+from uni4d_fg.frontend.trajectory_files import write_kitti, write_tum
+from uni4d_fg.geometry.trajectory import Trajectory
 from uni4d_fg.results.export.model import ExportJob
 
 

@@ -62,6 +62,10 @@ class DynamicWindow:
         if len(track):
             self._keep(~np.isin(self.observations.track, track))
 
+    def rescale(self, log_scale: float) -> None:
+        """Scale what is seen when the world turns out to have other metres."""
+        self.observations = replace(self.observations, depth=self.observations.depth * np.exp(log_scale))
+
     def solve(
         self, intrinsics: FloatArray, noise: StaticNoise, book: TrackBook, run: StageRunner
     ) -> dict[int, DynamicPoints]:

@@ -67,6 +67,7 @@ def locate(
     noise: StaticNoise,
     config: Config,
     run: StageRunner,
+    log_scale: float = 0.0,
 ) -> FramePose:
     """Solve a frame's pose and log-scale with the points held, from each guess; the most inliers win.
 
@@ -78,6 +79,7 @@ def locate(
         noise: Sigmas.
         config: Stage 2's kernels and outlier rule, and the pose solver.
         run: What solves the declared stage.
+        log_scale: What the depth cues of all frames share; the prior on the frame's own is about it.
     """
     zero = np.zeros(len(points), dtype=np.int64)
     observations = Observations(np.arange(len(points)), zero, tracks.uv, tracks.depth, tracks.weight)
@@ -85,7 +87,7 @@ def locate(
     sigma = noise.effective_depth_sigma(2.0) * ba.depth_sigma_factor
     batches = [
         reprojection_term(observations, observations.track, noise.reprojection_sigma_px, 1, ba, MAP),
-        *depth_prior_terms(observations, observations.track, sigma, 1, ba),
+        *depth_prior_terms(observations, observations.track, sigma, 1, ba, log_scale),
     ]
     free = {POSE: np.ones((1, 6), dtype=bool), LOG_SCALE: np.ones((1, 1), dtype=bool)}
     stage = Stage("pose", Problem(tuple(batches), free), config.incremental.pose_solver)
@@ -121,11 +123,4 @@ def larger_covariance(first: FloatArray, second: FloatArray) -> FloatArray:
     values, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
     factor = root @ (axes * np.sqrt(np.maximum(values, 1.0)))
     result: FloatArray = factor @ factor.T
-    return result
-
-
-def composed_covariance(reference: FloatArray, reference_T_cam: FloatArray, relative: FloatArray) -> FloatArray:
-    """Return the covariance of ``world_T_reference reference_T_cam`` from those of its two parts, (6, 6) each."""
-    back = se3.adjoint(se3.inverse(reference_T_cam))
-    result: FloatArray = back @ reference @ back.T + relative
     return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -13,6 +13,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.geometry import se3
+from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.optim.backend import choose_backend
 from uni4d_fg.optim.stage import LevenbergMarquardtRunner
 from uni4d_fg.slam.incremental.dynamic import DynamicWindow, in_world, moving_scales
@@ -26,7 +27,7 @@ from uni4d_fg.slam.incremental.model import (
     FrameUpdate,
     Landmarks,
 )
-from uni4d_fg.slam.incremental.pose import FramePose, composed_covariance, locate, predict
+from uni4d_fg.slam.incremental.pose import FramePose, locate, predict
 from uni4d_fg.slam.incremental.results import Results, ResultsInMemory, assemble_results
 from uni4d_fg.slam.incremental.smoother import make_smoother
 from uni4d_fg.slam.incremental.tracking import OnlineTracker
@@ -61,6 +62,8 @@ class IncrementalReconstructor:
         image_size: (height, width), px.
         config: The whole configuration; ``incremental`` has the window, the rest is that of the batch stages.
         results: Takes what leaves the window; kept in memory when None.
+        additions: Factors and variables of your own, asked for before every solve of the window; keys count frames from
+            the first, see :mod:`uni4d_fg.optim.added_factors`. Frames that are no keyframes are in no solve.
 
     Raises:
         ConfigError: If the configuration asks for what cannot be done in a window.
@@ -68,7 +71,12 @@ class IncrementalReconstructor:
     """
 
     def __init__(
-        self, intrinsics: FloatArray, image_size: tuple[int, int], config: Config, results: Results | None = None
+        self,
+        intrinsics: FloatArray,
+        image_size: tuple[int, int],
+        config: Config,
+        results: Results | None = None,
+        additions: Iterable[FactorSource] = (),
     ):
         if config.energy != "map" or config.solver != "lm":
             raise ConfigError("incremental solving is made for energy 'map' and solver 'lm'; the paper's norms have no "
@@ -85,7 +93,7 @@ class IncrementalReconstructor:
         self.config, self.image_size = config, image_size
         ba = config.bundle_adjustment
         noise = StaticNoise(ba.reprojection_sigma_px, ba.depth_sigma, ba.depth_correlation)
-        self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise)
+        self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise, sources=tuple(additions))
         self.dynamic = DynamicWindow(config, depth_sigma=ba.depth_sigma)
         self.book = TrackBook()
         self.tracker = OnlineTracker(config.tracking, incremental.max_live_tracks)
@@ -150,7 +158,9 @@ class IncrementalReconstructor:
         left: list[tuple[int, FloatArray, FloatArray, float]] = []
         if status is not FrameStatus.TRACKED:
             with self._timed("window"):
+                before = self.window.cue_scale
                 self.smoother.solve(self.window)
+                self._rescale(self.window.cue_scale - before)
             with self._timed("covariance"):
                 self.window.update_covariance()
             while self.smoother.must_slide(self.window):
@@ -195,7 +205,7 @@ class IncrementalReconstructor:
         self.pending = []
         self.window = CameraWindow(
             self.config, window.prior_intrinsics, window.intrinsics, window.noise,
-            intrinsics_covariance=window.intrinsics_covariance,
+            intrinsics_covariance=window.intrinsics_covariance, sources=window.sources,
         )  # fmt: skip
 
     def _checked(
@@ -231,7 +241,9 @@ class IncrementalReconstructor:
             static.label[usable], static.rejected,
         )  # fmt: skip
         guesses = [self._predicted(frame), self.last_pose]
-        found = locate(guesses, chosen, points[usable], window.intrinsics, window.noise, self.config, self._run)
+        found = locate(
+            guesses, chosen, points[usable], window.intrinsics, window.noise, self.config, self._run, window.cue_scale
+        )
         count = int(found.inlier.sum())
         if count < self.config.incremental.min_tracks:
             return None, count
@@ -287,6 +299,22 @@ class IncrementalReconstructor:
         none = DynamicPoints.none()
         self.pending.append(PendingFrame(frame, timestamp, status, keyframe, relative, covariance, log_scale, none))
 
+    def _rescale(self, log_scale: float) -> None:
+        """Let what was found at the old scale of the world follow where added factors have changed it.
+
+        Frames that hang on a keyframe were posed by landmarks of that time, and depths of moving points were scaled.
+        """
+        if log_scale == 0.0:
+            return
+        self.dynamic.rescale(log_scale)
+        for pending in self.pending:
+            points = pending.dynamic
+            pending.dynamic = replace(points, point=points.point * np.exp(log_scale))
+            if pending.status is FrameStatus.TRACKED:
+                pending.keyframe_T_cam = pending.keyframe_T_cam.copy()
+                pending.keyframe_T_cam[:3, 3] *= np.exp(log_scale)
+                pending.log_scale += log_scale
+
     def _bridged_frames(self) -> int:
         """Return how many of the newest frames were bridged."""
         last = bool(self.pending) and self.pending[-1].status is FrameStatus.BRIDGED
@@ -329,7 +357,7 @@ class IncrementalReconstructor:
                 pending.timestamp,
                 pending.status,
                 pose,
-                covariance if own else composed_covariance(covariance, pending.keyframe_T_cam, pending.covariance),
+                covariance if own else se3.composed_covariance(covariance, pending.keyframe_T_cam, pending.covariance),
                 log_scale if own else pending.log_scale,
                 in_world(pending.dynamic, pose),
             )
@@ -350,7 +378,7 @@ class IncrementalReconstructor:
             newest = self.pending[-1]
             covariance = window.covariance[-1]
             if newest.status is FrameStatus.TRACKED:
-                covariance = composed_covariance(covariance, newest.keyframe_T_cam, newest.covariance)
+                covariance = se3.composed_covariance(covariance, newest.keyframe_T_cam, newest.covariance)
         return FrameUpdate(
             status, max(self.num_frames - 1, 0), self.last_pose, covariance, window.landmark_track, window.landmark,
             dynamic, finished, landmarks, window.error_px, used, len(window), dict(self._seconds),

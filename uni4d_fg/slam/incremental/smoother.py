@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from uni4d_fg.config.incremental import IncrementalConfig
 from uni4d_fg.errors import SolverError
-from uni4d_fg.optim.added_factors import FactorSource, with_additions
 from uni4d_fg.optim.isam2 import Isam2Runner
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.slam.incremental.window import CameraWindow
@@ -72,14 +70,8 @@ class Isam2Smoother:
         return False
 
 
-def make_smoother(config: IncrementalConfig, run: StageRunner, sources: Sequence[FactorSource] = ()) -> Smoother:
-    """Return the configured back end.
-
-    Args:
-        config: Which, and its limits.
-        run: What solves a window.
-        sources: Factors of the user's own that join every solve of 'isam2'; ``run`` has added them to a window's.
-    """
+def make_smoother(config: IncrementalConfig, run: StageRunner) -> Smoother:
+    """Return the configured back end; ``run`` solves a window."""
     if config.smoother == "window":
         return WindowSmoother(config, run)
-    return Isam2Smoother(config, with_additions(Isam2Runner(config.isam2_relinearize_threshold), sources))
+    return Isam2Smoother(config, Isam2Runner(config.isam2_relinearize_threshold))

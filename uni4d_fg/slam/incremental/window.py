@@ -9,7 +9,9 @@ A landmark is seen by many frames, and a frame that leaves takes its observation
   once per length of the window, in a phase of its own, and starts anew as another landmark; between, it drops
   what leaves. The phases differ, so that at any time nearly all tracks tie the newest frames to those before.
 
-The prior is on cameras only (poses, log-scales, intrinsics), so that landmarks stay independent of each other.
+The prior is on cameras only (poses, log-scales, intrinsics) and on variables that were added, so that landmarks stay
+independent of each other. What was added to a solve (:mod:`uni4d_fg.optim.added_factors`) leaves in the same way: added
+factors on the leaving keyframe, and added variables of its frame or an earlier one, are marginalized with it.
 """
 
 from __future__ import annotations
@@ -22,10 +24,11 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.factors.batch import FactorBatch, Slot
-from uni4d_fg.factors.marginalization_prior import marginalization_prior_type
+from uni4d_fg.factors.marginalization_prior import MARGINALIZATION_PRIOR, marginalization_prior_type
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
-from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.factors.variable_types import CUE_SCALE, INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.optim.added_factors import AddedValues, FactorSource, JoinedStage, join_additions
 from uni4d_fg.optim.cluster_robust import Clusters, Spread
 from uni4d_fg.optim.marginalization import marginalize_with_spread
 from uni4d_fg.optim.stage import Stage, StageRunner
@@ -68,6 +71,40 @@ class LeftKeyframe:
     log_scale: float
 
 
+@dataclass(frozen=True)
+class KeyedPrior:
+    """The linear prior that older keyframes left, on variables by the numbers of their keys."""
+
+    batch: FactorBatch
+    """Its rows mean nothing."""
+    numbers: tuple[tuple[int, ...], ...]
+    """Of each slot's variable."""
+
+    @classmethod
+    def of(cls, batch: FactorBatch, state: State) -> KeyedPrior:
+        """Take over a prior on rows of a state."""
+        numbers = (state.numbers(s.variable)[int(s.rows[0])].tolist() for s in batch.slots)
+        return cls(batch, tuple(tuple(n) for n in numbers))
+
+    def on(self, state: State) -> FactorBatch:
+        """Return it on the rows of a state."""
+        rows = {s.variable: {n: i for i, n in enumerate(map(tuple, state.numbers(s.variable).tolist()))}
+                for s in self.batch.slots}  # fmt: skip
+        slots = (Slot(s.variable, np.array([rows[s.variable][n]])) for s, n in self._places())
+        return replace(self.batch, slots=tuple(slots))
+
+    def reads(self, other_than: State) -> dict[VariableType, list[tuple[int, ...]]]:
+        """Return the numbers of its variables of types that a state does not have."""
+        out: dict[VariableType, list[tuple[int, ...]]] = {}
+        for slot, numbers in self._places():
+            if slot.variable not in other_than:
+                out.setdefault(slot.variable, []).append(numbers)
+        return out
+
+    def _places(self) -> list[tuple[Slot, tuple[int, ...]]]:
+        return list(zip(self.batch.slots, self.numbers, strict=True))
+
+
 @dataclass
 class CameraWindow:
     """Keyframes, their static observations, landmarks, and the prior that older ones left."""
@@ -93,7 +130,11 @@ class CameraWindow:
     landmark_track: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(N,) ascending."""
     landmark: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    prior: FactorBatch | None = None
+    sources: tuple[FactorSource, ...] = ()
+    """Asked for factors before every solve."""
+    added: AddedValues = field(default_factory=AddedValues)
+    """Present values of the variables that they added."""
+    prior: KeyedPrior | None = None
     spread: Spread | None = None
     """Of the prior's gradient, on the columns of its slots."""
     slides: int = 0
@@ -104,6 +145,11 @@ class CameraWindow:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def cue_scale(self) -> float:
+        """Log-scale of the depth cue that all frames share, where added factors know lengths; 0 where none does."""
+        return float(self.added.of(CUE_SCALE).get((0,), np.zeros(1))[0])
 
     def append(self, frame: int, pose: FloatArray, log_scale: float, observations: LabelledFrame, bridged: int) -> None:
         """Add a keyframe at its starting pose, and landmarks for the tracks that have become long enough."""
@@ -135,16 +181,18 @@ class CameraWindow:
         """Solve the window, drop outliers, measure the noise; fix the intrinsics once they are known."""
         if len(self) < 2:
             return
-        state, observations, stage = self._stage()
-        state, _ = run(stage, state, None)
+        state, observations, joined = self._stage()
+        solved, _ = run(joined.stage, joined.state, None)
+        self.added.take(solved, joined.added)
+        state = state.replace({variable: solved[variable] for variable in state.arrays})
         self._take(state)
         if len(observations):
             self._drop(state, observations)
 
     def update_covariance(self) -> None:
         """Compute the marginal covariances at the present state."""
-        state, used, stage = self._stage()
-        marginals = static_marginals(stage, state, self._clusters(used), self.spread)
+        _, used, joined = self._stage()
+        marginals = static_marginals(joined.stage, joined.state, self._clusters(used), self.spread)
         if marginals is None:
             self.covariance = np.full((len(self), 6, 6), np.nan)
             return
@@ -158,10 +206,10 @@ class CameraWindow:
 
     def slide(self) -> tuple[LeftKeyframe, LeftLandmarks]:
         """Marginalize the oldest keyframe with the landmarks whose turn it is."""
-        state, used, stage = self._stage()
+        state, used, joined = self._stage()
         leaving_landmark = self._leaving_landmarks(used)
         left = self._hand_over(state, used, leaving_landmark)
-        self.prior, self.spread = self._reduce(stage, state, used, leaving_landmark)
+        self.prior, self.spread = self._reduce(joined, used, leaving_landmark)
         oldest = LeftKeyframe(int(self.frame[0]), self.pose[0], self.covariance[0], float(self.log_scale[0]))
         gone = np.isin(self.observations.track, self.landmark_track[leaving_landmark]) | (self.observations.frame == 0)
         kept = self.observations.select(~gone)
@@ -214,8 +262,12 @@ class CameraWindow:
         enough = self.slides > 0 or len(self) >= self.config.incremental.free_intrinsics_from
         return self.intrinsics_free and enough and self.config.input.intrinsics == "free"
 
-    def _stage(self) -> tuple[State, Observations, Stage]:
-        """Declare the solve; observations are those of landmarks, tracks numbered by landmark row."""
+    def _stage(self) -> tuple[State, Observations, JoinedStage]:
+        """Declare the solve, without what is added and with it.
+
+        Returns:
+            The window's own state, the observations of landmarks, tracks numbered by landmark row, and the whole solve.
+        """
         at = np.searchsorted(self.landmark_track, self.observations.track)
         at = np.minimum(at, max(len(self.landmark_track) - 1, 0))
         mine = np.zeros(len(at), dtype=bool)
@@ -223,17 +275,20 @@ class CameraWindow:
             mine = self.landmark_track[at] == self.observations.track
         chosen = replace(self.observations.select(mine), track=at[mine])
         chosen = chosen.select(np.lexsort([chosen.frame, chosen.track]))
-        state = self._cameras().state(self.landmark, self.landmark_track)
+        state = self._cameras().state(self.landmark, self.landmark_track, self.frame)
         ba = self.config.bundle_adjustment
         problem = bundle_adjustment_problem(
             state, chosen, self.noise, ba, self.prior_intrinsics[None],
             Freedom(poses=True, intrinsics=self._free_intrinsics()), camera_motion=self._motion_terms(),
         ).add(self._bridge_terms())  # fmt: skip
-        if self.prior is not None:
-            problem.add(self.prior)
         if self.slides:  # the prior holds the gauge
             problem.free = {**problem.free, POSE: np.ones((len(self), 6), dtype=bool)}
-        return state, chosen, Stage("bundle_adjustment", problem, self.config.incremental.solver)
+        stage = Stage("bundle_adjustment", problem, self.config.incremental.solver)
+        kept = {} if self.prior is None else self.prior.reads(state)
+        joined = join_additions(self.sources, stage, state, self.added, kept)
+        if self.prior is not None:
+            joined.stage.problem.add(self.prior.on(joined.state))
+        return state, chosen, joined
 
     def _cameras(self) -> Cameras:
         return Cameras(self.pose, self.intrinsics, self.log_scale)
@@ -328,12 +383,18 @@ class CameraWindow:
         return replace(found, of_landmark=cells)
 
     def _reduce(
-        self, stage: Stage, state: State, used: Observations, leaving: BoolArray
-    ) -> tuple[FactorBatch | None, Spread | None]:
-        """Return the prior that the oldest keyframe and its landmarks leave, on rows that have moved up by one."""
+        self, joined: JoinedStage, used: Observations, leaving: BoolArray
+    ) -> tuple[KeyedPrior | None, Spread | None]:
+        """Return the prior that the oldest keyframe, its landmarks and what was added to it leave."""
+        stage, state = joined.stage, joined.state
+        gone = {POSE: np.arange(len(self)) == 0, LOG_SCALE: np.arange(len(self)) == 0}
+        for variable in joined.added:
+            if "frame" in variable.index:
+                number = state.numbers(variable)[:, variable.index.index("frame")]
+                gone[variable] = number <= self.frame[0]
 
         def touches(batch: FactorBatch) -> BoolArray:
-            if batch is self.prior:
+            if batch.name == MARGINALIZATION_PRIOR:
                 return np.ones(1, dtype=bool)
             out = np.zeros(len(batch), dtype=bool)
             for slot in batch.slots:
@@ -341,7 +402,8 @@ class CameraWindow:
                     out |= leaving[slot.rows]
             if not any(slot.variable == LANDMARK for slot in batch.slots):
                 for slot in batch.slots:
-                    out |= (slot.rows == 0) & (slot.variable in (POSE, LOG_SCALE))
+                    if slot.variable in gone:
+                        out |= gone[slot.variable][slot.rows]
             return out
 
         batches = tuple(batch.take(np.flatnonzero(touches(batch))) for batch in stage.problem.batches if len(batch))
@@ -351,18 +413,16 @@ class CameraWindow:
         place = np.cumsum(leaving) - 1
         batches = tuple(_renumbered(batch, LANDMARK, lambda r: place[r]) for batch in batches)
         part = state.replace({LANDMARK: state[LANDMARK][rows]})
-        oldest = np.arange(len(self)) == 0
         clusters = self._clusters(used)
         if clusters is not None:
             clusters = replace(clusters, of_landmark=clusters.of_landmark[rows])
         found = marginalize_with_spread(
-            batches, part, free, {POSE: oldest, LOG_SCALE: oldest}, stage.solver,
-            clusters=clusters, carried=self.spread,
+            batches, part, free, gone, stage.solver, clusters=clusters, carried=self.spread
         )  # fmt: skip
-        if found is None:
-            return None, None
-        prior = _renumbered(found[0], POSE, lambda r: r - 1)
-        return _renumbered(prior, LOG_SCALE, lambda r: r - 1), found[1]
+        for variable in joined.added:
+            if variable in gone:
+                self.added.forget(variable, map(tuple, state.numbers(variable)[gone[variable]].tolist()))
+        return (None, None) if found is None else (KeyedPrior.of(found[0], state), found[1])
 
 
 def _renumbered(batch: FactorBatch, variable: VariableType, rows: Callable[[IntArray], IntArray]) -> FactorBatch:

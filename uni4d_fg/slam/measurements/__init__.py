@@ -1,1 +1,1 @@
-"""Measurements of other sensors as factors of the stages."""
+"""Measurements of other sensors as factors that join the stages: one source per kind."""

@@ -2,9 +2,8 @@
 
 Per pair of successive frames one ``gtsam.CombinedImuFactorWithGravityVector`` on both poses, velocities and biases and
 on gravity, whose direction is free and whose magnitude is known. With the first pose held, scale, velocities and
-gravity follow from the measurements. Terms of the stage give way: the prior that centers the frames' log-scales at zero
-is centered at a value that they have in common and that is free (the cue may be of any scale); the anchor of the scale
-and the smoothness of the camera's motion are dropped, because the sensor knows better.
+gravity follow from the measurements. The depth cue may be of any scale (:mod:`uni4d_fg.optim.metric_scale`). The anchor
+of the scale and the smoothness of the camera's motion are dropped, because the sensor knows better.
 """
 
 from __future__ import annotations
@@ -17,13 +16,10 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.imu import ImuConfig
-from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
-from uni4d_fg.factors.factor_type import FactorType
-from uni4d_fg.factors.priors import gravity_magnitude, log_scale_about_common, log_scale_prior, scale_anchor
+from uni4d_fg.factors.priors import gravity_magnitude, scale_anchor
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable import VariableType
-from uni4d_fg.factors.variable_types import COMMON_LOG_SCALE, GRAVITY, IMU_BIAS, LOG_SCALE, POSE, VELOCITY
+from uni4d_fg.factors.variable_types import GRAVITY, IMU_BIAS, POSE, VELOCITY
 from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.optim.added_factors import Addition
 from uni4d_fg.optim.stage import Stage
@@ -52,20 +48,15 @@ class ImuSource:
         """Return what joins a stage; None for other stages than those of the static scene."""
         if stage.kind not in ("bundle_adjustment", "structure"):
             return None
-        factors: list[Any] = [*self._about_common_scale(stage)]
-        variables: dict[VariableType, FloatArray] = {}
-        if factors:
-            variables[COMMON_LOG_SCALE] = np.mean(state[LOG_SCALE], axis=0, keepdims=True)
-        replaced: list[FactorType] = [log_scale_prior]
-        if stage.kind == "bundle_adjustment":
-            factors += self._inertial_factors()
-            variables |= {
-                VELOCITY: self.start.velocity,
-                IMU_BIAS: np.tile(self.start.bias, (len(self.start.velocity), 1)),
-                GRAVITY: self.start.gravity[None],
-            }
-            replaced += [scale_anchor, camera_rotation, camera_translation]
-        return Addition(factors, variables, replaces=replaced)
+        if stage.kind == "structure":  # has frozen cameras: all that there is to say is that they are metric
+            return Addition([])
+        variables = {
+            VELOCITY: self.start.velocity,
+            IMU_BIAS: np.tile(self.start.bias, (len(self.start.velocity), 1)),
+            GRAVITY: self.start.gravity[None],
+        }
+        replaced = [scale_anchor, camera_rotation, camera_translation]
+        return Addition(self._inertial_factors(), variables, replaces=replaced)
 
     def _inertial_factors(self) -> list[Any]:
         config, gravity = self.config, GRAVITY.key(0)
@@ -81,12 +72,3 @@ class ImuSource:
         factors.append(gtsam.PriorFactorConstantBias(IMU_BIAS.key(0), gtsam.imuBias.ConstantBias(), noise))
         factors.append(gravity_magnitude(0, magnitude=np.array([config.gravity]), sigma=config.gravity_sigma))
         return factors
-
-    @staticmethod
-    def _about_common_scale(stage: Stage) -> list[FactorBatch]:
-        """Return the stage's prior on log-scales with a free center."""
-        return [
-            log_scale_about_common(batch.slots[0].rows, 0, sigma=batch.sigma, weight=batch.weight, kernel=batch.kernel)
-            for batch in stage.problem.batches
-            if batch.factor_type is log_scale_prior
-        ]

@@ -22,7 +22,7 @@ from uni4d_fg.factors.priors import log_scale_prior, scale_anchor
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
-from uni4d_fg.optim.added_factors import HOLDS_SCALE, as_solved
+from uni4d_fg.optim.added_factors import HOLDS_SCALE, joined_by
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
@@ -129,9 +129,14 @@ def reprojection_term(
 
 
 def depth_prior_terms(
-    observations: Observations, row: IntArray, sigma: float, num_frames: int, config: BundleAdjustmentConfig
+    observations: Observations,
+    row: IntArray,
+    sigma: float,
+    num_frames: int,
+    config: BundleAdjustmentConfig,
+    log_scale: float = 0.0,
 ) -> list[FactorBatch]:
-    """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales."""
+    """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales about one."""
     known = np.isfinite(observations.depth)
     seen = observations.select(known)
     return [
@@ -140,7 +145,7 @@ def depth_prior_terms(
             depth=seen.depth, sigma=sigma, weight=seen.weight, kernel=kernel_of(config.depth_kernel),
         ),
         log_scale_prior(
-            np.arange(num_frames), measured=np.zeros((num_frames, 1)), sigma=config.depth_scale_prior_sigma
+            np.arange(num_frames), measured=np.full((num_frames, 1), log_scale), sigma=config.depth_scale_prior_sigma
         ),
     ]  # fmt: skip
 
@@ -202,7 +207,7 @@ def adjust_bundle(
         if config.depth_prior and freedom.poses and HOLDS_SCALE not in summary.notes:
             state = hold_metric_scale(state)
         if index == rounds - 1 and energy.is_likelihood:
-            covariances = _covariances(*as_solved(run, stage, state), observations, config)
+            covariances = _covariances(stage, state, observations, config, run)
         state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
             counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)
@@ -279,10 +284,13 @@ def hold_metric_scale(state: State) -> State:
 
 
 def _covariances(
-    stage: Stage, state: State, observations: Observations, config: BundleAdjustmentConfig
+    stage: Stage, state: State, observations: Observations, config: BundleAdjustmentConfig, run: StageRunner
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the marginal covariances of poses and intrinsics at the end of a MAP solve."""
-    marginals = static_marginals(stage, state, track_cells(observations, state[INTRINSICS][0], config))
+    """Return the marginal covariances of poses and intrinsics at the end of a MAP solve, added factors included."""
+    joined, clusters = joined_by(run, stage, state), track_cells(observations, state[INTRINSICS][0], config)
+    marginals = static_marginals(joined.stage, joined.state, clusters)
+    if marginals is None and joined.added:  # added variables that nothing determines say nothing of the cameras
+        marginals = static_marginals(stage, state, clusters)
     if marginals is None:
         return unknown_covariances(len(state[POSE]))
     return marginals.blocks(POSE, len(state[POSE])), marginals.blocks(INTRINSICS, 1)[0]

@@ -31,15 +31,22 @@ class Cameras:
         poses[0] = np.eye(4)
         return Cameras(poses, self.intrinsics.copy(), self.log_scale[start:stop].copy())
 
-    def state(self, landmarks: FloatArray, track: IntArray | None = None) -> State:
-        """Return the variables of a static scene with landmarks (N, 3) of the given tracks (N,)."""
+    def state(self, landmarks: FloatArray, track: IntArray | None = None, frame: IntArray | None = None) -> State:
+        """Return the variables of a static scene with landmarks (N, 3) of the given tracks (N,).
+
+        Args:
+            landmarks: (N, 3).
+            track: (N,) their numbers; row numbers when None.
+            frame: (T,) numbers of the frames; row numbers when None.
+        """
         arrays = {
             POSE: self.world_T_cam,
             INTRINSICS: self.intrinsics.reshape(1, 4),
             LOG_SCALE: self.log_scale.reshape(-1, 1),
             LANDMARK: landmarks,
         }
-        return State(arrays, {} if track is None else {LANDMARK: track})
+        index = {} if track is None else {LANDMARK: track}
+        return State(arrays, index if frame is None else {**index, POSE: frame, LOG_SCALE: frame})
 
     @classmethod
     def of(cls, state: State) -> Cameras:

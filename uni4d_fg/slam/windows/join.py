@@ -26,13 +26,14 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.se3 import inverse_right_jacobian, se3_log
 from uni4d_fg.optim.cluster_robust import MIN_CLUSTERS, Spread
 from uni4d_fg.slam.stages.scene import Cameras
+from uni4d_fg.slam.windows.added_terms import FRAME, AddedTerms, Entries
 from uni4d_fg.slam.windows.plan import Window
 
 _STEP_SIZE = 1e-9
 """A Gauss-Newton step below this ends the solve (rad, m, log)."""
 _MAX_STEPS = 10
-_FRAME = 7
-"""Columns per frame: twist, log-scale. The intrinsics' four stand at the end."""
+_MAX_STEPS_ADDED = 50
+"""With added factors, whose kernels are reweighted from step to step."""
 
 
 @dataclass(frozen=True)
@@ -53,23 +54,23 @@ class WindowInformation:
 
     def columns(self, num_frames: int) -> IntArray:
         """Return the place (n,) of its columns among those of all frames."""
-        frames = np.arange(_FRAME * self.window.start, _FRAME * self.window.stop)
-        return np.concatenate([frames, _FRAME * num_frames + np.arange(4)])
+        frames = np.arange(FRAME * self.window.start, FRAME * self.window.stop)
+        return np.concatenate([frames, FRAME * num_frames + np.arange(4)])
 
     def difference(self, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
         """Return d (n,) and its Jacobian (n, n) with respect to the shared cameras' tangents."""
         here, count = cameras.part(self.window.start, self.window.stop), len(self.window)
         twist = se3_log(se3.inverse(self.point.world_T_cam) @ here.world_T_cam)
         inverse_jacobian = inverse_right_jacobian(twist)
-        d, jacobian = np.zeros(_FRAME * count + 4), np.eye(_FRAME * count + 4)
+        d, jacobian = np.zeros(FRAME * count + 4), np.eye(FRAME * count + 4)
         for i in range(count):
-            own = slice(_FRAME * i, _FRAME * i + 6)
+            own = slice(FRAME * i, FRAME * i + 6)
             d[own] = twist[i]
             jacobian[own, own] = inverse_jacobian[i] if i else 0.0
             if i:
                 back = se3.adjoint(se3.inverse(here.world_T_cam[i]))
                 jacobian[own, :6] = -inverse_jacobian[i] @ back
-        d[6 : _FRAME * count : _FRAME] = here.log_scale - self.point.log_scale
+        d[6 : FRAME * count : FRAME] = here.log_scale - self.point.log_scale
         d[-4:] = here.intrinsics - self.point.intrinsics
         return d, jacobian
 
@@ -109,66 +110,78 @@ def chain(windows: list[Window], parts: list[Cameras]) -> Cameras:
 
 
 def join(
-    information: list[WindowInformation], start: Cameras, intrinsics_covariance: FloatArray, *, covariance: bool
+    information: list[WindowInformation],
+    start: Cameras,
+    intrinsics_covariance: FloatArray,
+    *,
+    covariance: bool,
+    added: AddedTerms | None = None,
 ) -> Joined:
-    """Minimise the windows' energies together.
+    """Minimise the windows' energies, and those of added factors, together.
 
     Args:
         information: Of every window.
         start: Where to start; its intrinsics stay.
         intrinsics_covariance: (4, 4) of these; zero for those that are known.
         covariance: Whether to compute covariances; NaN otherwise.
+        added: Factors on all frames that the windows do not know of; their own variables move along.
 
     Raises:
         SolverError: If the windows do not determine a camera.
     """
     cameras, num_frames = start, len(start.world_T_cam)
-    size = _FRAME * num_frames + 4
+    base = FRAME * num_frames + 4
+    size = base if added is None else added.size
     free = np.ones(size, dtype=bool)
     free[:6] = False
-    free[-4:] = False
+    if added is not None:
+        free = added.free
+    free[base - 4 : base] = False
     at = np.flatnonzero(free)
-    for _ in range(_MAX_STEPS):
-        gradient, blocks = np.zeros(size), []
+    for _ in range(_MAX_STEPS if added is None else _MAX_STEPS_ADDED):
+        gradient, entries = np.zeros(size), []
         for part in information:
             d, jacobian = part.difference(cameras)
-            blocks.append(jacobian.T @ part.hessian @ jacobian)
+            entries.append(_entries(part, jacobian.T @ part.hessian @ jacobian, num_frames))
             gradient[part.columns(num_frames)] += jacobian.T @ (part.hessian @ d + part.gradient)
-        solver = _factorise(information, blocks, num_frames, at)
+        if added is not None:
+            slope, more = added.linearize(cameras)
+            gradient += slope
+            entries += more
+        solver = _factorise(entries, size, at)
         step = np.zeros(size)
         step[at] = -solver.solve(gradient[at])
         if not np.isfinite(step).all():
             raise SolverError("joining windows: a step is not finite; use longer windows or a wider overlap")
-        cameras = _moved(cameras, step)
+        cameras = _moved(cameras, step[:base])
+        if added is not None:
+            added.move(step)
         if np.abs(step).max() < _STEP_SIZE:
             break
     if not covariance:
         return Joined(cameras, np.full((num_frames, 6, 6), np.nan), np.full((4, 4), np.nan))
-    uncertain = size - 4 + np.flatnonzero(np.diag(intrinsics_covariance) > 0)
+    uncertain = base - 4 + np.flatnonzero(np.diag(intrinsics_covariance) > 0)
     known = np.zeros((4, 4))
-    inside = np.ix_(uncertain - size + 4, uncertain - size + 4)
+    inside = np.ix_(uncertain - base + 4, uncertain - base + 4)
     known[inside] = np.linalg.inv(intrinsics_covariance[inside])
-    return Joined(cameras, *_covariances(information, cameras, np.concatenate([at, uncertain]), known))
+    return Joined(cameras, *_covariances(information, cameras, np.sort(np.concatenate([at, uncertain])), known, added))
 
 
 def _moved(cameras: Cameras, step: FloatArray) -> Cameras:
-    frames = step[:-4].reshape(-1, _FRAME)
+    frames = step[:-4].reshape(-1, FRAME)
     poses = se3.orthonormalize(se3.retract(cameras.world_T_cam, frames[:, :6]))
     return Cameras(poses, cameras.intrinsics + step[-4:], cameras.log_scale + frames[:, 6])
 
 
-def _factorise(
-    information: list[WindowInformation], blocks: list[FloatArray], num_frames: int, at: IntArray
-) -> scipy.sparse.linalg.SuperLU:
-    size = _FRAME * num_frames + 4
-    rows, columns, values = [], [], []
-    for part, block in zip(information, blocks, strict=True):
-        place = part.columns(num_frames)
-        rows.append(np.repeat(place, len(place)))
-        columns.append(np.tile(place, len(place)))
-        values.append(block.reshape(-1))
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    matrix = scipy.sparse.csc_matrix(entries, shape=(size, size))[at][:, at].tocsc()
+def _entries(part: WindowInformation, block: FloatArray, num_frames: int) -> Entries:
+    """Return the entries of a window's block among those of all frames."""
+    place = part.columns(num_frames)
+    return np.repeat(place, len(place)), np.tile(place, len(place)), block.reshape(-1)
+
+
+def _factorise(entries: list[Entries], size: int, at: IntArray) -> scipy.sparse.linalg.SuperLU:
+    rows, columns, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+    matrix = scipy.sparse.csc_matrix((values, (rows, columns)), shape=(size, size))[at][:, at].tocsc()
     try:
         return scipy.sparse.linalg.splu(
             matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
@@ -180,28 +193,36 @@ def _factorise(
 
 
 def _covariances(
-    information: list[WindowInformation], cameras: Cameras, at: IntArray, known: FloatArray
+    information: list[WindowInformation],
+    cameras: Cameras,
+    at: IntArray,
+    known: FloatArray,
+    added: AddedTerms | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return pose (T, 6, 6) and intrinsics (4, 4) covariances; see :mod:`uni4d_fg.optim.cluster_robust`.
 
     The sum over clusters, and over factors without landmarks, is taken through one solve per cluster and one per
-    direction in which a window's other factors know anything.
+    direction in which a window's other factors, or an added one, know anything.
     """
     num_frames = len(cameras.world_T_cam)
-    size = _FRAME * num_frames + 4
+    base = FRAME * num_frames + 4
+    size = base if added is None else added.size
     jacobians = [part.difference(cameras)[1] for part in information]
     curvatures = [j.T @ part.curvature @ j for part, j in zip(information, jacobians, strict=True)]
     curvatures[0][-4:, -4:] += known
-    solver = _factorise(information, curvatures, num_frames, at)
+    entries = [_entries(part, block, num_frames) for part, block in zip(information, curvatures, strict=True)]
+    if added is not None:
+        entries += added.linearize(cameras)[1]
+    solver = _factorise(entries, size, at)
     poses, intrinsics = np.zeros((num_frames, 6, 6)), np.zeros((4, 4))
 
     def add(sides: FloatArray, factor: float = 1.0) -> None:
         """Add the outer products of the solutions of (m, size) right-hand sides."""
         solved = np.zeros_like(sides)
         solved[:, at] = solver.solve(np.ascontiguousarray(sides[:, at].T)).T
-        frames = solved[:, :-4].reshape(len(sides), num_frames, _FRAME)[:, :, :6]
+        frames = solved[:, : base - 4].reshape(len(sides), num_frames, FRAME)[:, :, :6]
         poses[:] += factor * np.einsum("mti,mtj->tij", frames, frames, optimize=True)
-        intrinsics[:] += factor * solved[:, -4:].T @ solved[:, -4:]
+        intrinsics[:] += factor * solved[:, base - 4 : base].T @ solved[:, base - 4 : base]
 
     spreads = [part.spread for part in information]
     scores = None
@@ -217,13 +238,15 @@ def _covariances(
         else:
             add(scores, used / (used - 1.0))
     calibrated = np.zeros((4, size))
-    calibrated[:, -4:] = _root(known)
+    calibrated[:, base - 4 : base] = _root(known)
     add(calibrated)
     for part, j in zip(information, jacobians, strict=True):
         rest = part.curvature if scores is None or part.spread is None else part.spread.rest
         sides = np.zeros((len(rest), size))
         sides[:, part.columns(num_frames)] = _root(rest) @ j
         add(sides[np.any(sides != 0.0, axis=1)])
+    for sides in () if added is None else added.root_rows(cameras):
+        add(sides)
     return poses, intrinsics
 
 

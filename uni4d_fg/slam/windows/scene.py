@@ -14,6 +14,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch
+from uni4d_fg.factors.priors import log_scale_prior
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.frontend.track_model import LabelledTracks
@@ -38,6 +39,7 @@ from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import landmark_errors, spatial_inliers
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 from uni4d_fg.slam.windows.join import WindowInformation
+from uni4d_fg.slam.windows.numbered import NumberedRunner
 from uni4d_fg.slam.windows.plan import (
     TrackSpans,
     Window,
@@ -122,6 +124,7 @@ def solve_scene(
     run: StageRunner,
     *,
     free_intrinsics: bool = False,
+    frames: IntArray | None = None,
 ) -> tuple[WindowScene, list[SolveSummary], dict[str, int]]:
     """Run stages 1 and 2 on a window.
 
@@ -135,6 +138,7 @@ def solve_scene(
         hooks: Progress and cancellation.
         run: What solves each declared stage.
         free_intrinsics: Whether the intrinsics move.
+        frames: (F,) numbers of its frames in the video, where they do not follow each other.
 
     Returns:
         The scene, the solves, and how much was dropped, per reason.
@@ -145,6 +149,7 @@ def solve_scene(
     """
     # Landmarks and covariances are those of the joined cameras, later.
     settings = config.bundle_adjustment.model_copy(update={"structure": "keep", "covariance_cells": 0})
+    run = NumberedRunner(run, window.frames if frames is None else frames, tracks.track)
     solver = StaticSceneSolver(config.model_copy(update={"bundle_adjustment": settings}), run, hooks)
     given = None
     if initial_world_T_cam is not None:
@@ -199,8 +204,9 @@ def calibrate(
     ba = without_camera_motion(config.bundle_adjustment)
     settings = config.model_copy(update={"bundle_adjustment": ba})
     scene, solves, _ = solve_scene(
-        tracks_in(labelled, chosen), window, intrinsics, intrinsics, None, settings, hooks, run, free_intrinsics=True
-    )
+        tracks_in(labelled, chosen), window, intrinsics, intrinsics, None, settings, hooks, run,
+        free_intrinsics=True, frames=chosen,
+    )  # fmt: skip
     problem = bundle_adjustment_problem(
         scene.state(), scene.observations, scene.noise, ba, intrinsics[None], Freedom(poses=True, intrinsics=True)
     )
@@ -220,7 +226,8 @@ def place(scene: WindowScene, cameras: Cameras, config: BundleAdjustmentConfig, 
         moved.state(), scene.observations, scene.noise, config, cameras.intrinsics[None],
         Freedom(poses=False, intrinsics=False),
     ).fix(LOG_SCALE)  # fmt: skip
-    state, _ = run(Stage("structure", problem, config.structure_solver), moved.state(), None)
+    numbered = NumberedRunner(run, scene.window.frames)
+    state, _ = numbered(Stage("structure", problem, config.structure_solver), moved.state(), None)
     return replace(moved, landmark=state[LANDMARK])
 
 
@@ -242,8 +249,17 @@ def owned(scene: WindowScene, spans: TrackSpans, windows: list[Window], index: i
     return replace(scene, landmark=scene.landmark[rows], track=track[rows], observations=replace(kept, track=row))
 
 
-def information(scene: WindowScene, windows: list[Window], index: int, config: Config) -> WindowInformation:
+def information(
+    scene: WindowScene, windows: list[Window], index: int, config: Config, *, log_scale_priors: bool = True
+) -> WindowInformation:
     """Linearize what a window owns at its present point and eliminate its landmarks; intrinsics have no prior here.
+
+    Args:
+        scene: What the window owns.
+        windows: All windows.
+        index: Which of them.
+        config: The whole configuration.
+        log_scale_priors: Whether the priors on the frames' log-scales are among it.
 
     Raises:
         SolverError: If a factor is not finite.
@@ -255,7 +271,9 @@ def information(scene: WindowScene, windows: list[Window], index: int, config: C
         state, scene.observations, scene.noise, ba, given[None], Freedom(poses=True, intrinsics=free_intrinsics)
     )
     batches = tuple(_owned_factors(batch, middle_frames(windows, index)) for batch in problem.batches)
-    batches = tuple(batch for batch in batches if len(batch))
+    batches = tuple(
+        batch for batch in batches if len(batch) and (log_scale_priors or batch.factor_type is not log_scale_prior)
+    )
     known = determined_points(batches, state)
     free = {**problem.free, LANDMARK: np.tile(known[:, None], (1, 3))}
     batches = tuple(_on_points(batch, known) for batch in batches)
@@ -311,7 +329,8 @@ def finish(scene: WindowScene, cameras: Cameras, config: BundleAdjustmentConfig,
     state, observations, noise = scene.cameras.state(scene.landmark), scene.observations, scene.noise
     solves: list[SolveSummary] = []
     if config.structure == "refine":
-        state, noise, solves = refine_structure(state, observations, noise, config, None, run)
+        numbered = NumberedRunner(run, scene.window.frames, scene.track)
+        state, noise, solves = refine_structure(state, observations, noise, config, None, numbered)
     if config.structure == "relift":
         state = relift_structure(state, observations)
     landmarks = state[LANDMARK]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_path
-from uni4d_fg.results.evaluate.trajectory import Trajectory
+from uni4d_fg.geometry.trajectory import Trajectory
 
 TUM_FORMAT = "timestamp tx ty tz qx qy qz qw"
 KITTI_FORMAT = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
@@ -26,23 +26,43 @@ def read_tum(path: Path) -> Trajectory:
         InputError: If the file is missing, a line does not hold 8 finite numbers, a quaternion is not of
             unit length (to 1 %), or timestamps decrease; the message names the line.
     """
-    rows, lines = _read_rows(path, 8, f"TUM ({TUM_FORMAT})")
+    return read_tum_with(path, ())[0]
+
+
+def read_tum_with(path: Path, columns: tuple[str, ...]) -> tuple[Trajectory, FloatArray | None]:
+    """Read a TUM trajectory whose lines may all have some columns more.
+
+    Args:
+        path: The file.
+        columns: Names of the further columns; positive numbers.
+
+    Returns:
+        The trajectory, and the further columns (T, len(columns)); None where the file does not have them.
+
+    Raises:
+        InputError: As :func:`read_tum`, and if some lines have the columns and others not, or one is not positive.
+    """
+    expected = f"TUM ({' '.join((TUM_FORMAT, *(f'[{name}]' for name in columns)))})"
+    rows, lines = _read_rows(path, (8, 8 + len(columns)) if columns else (8,), expected)
     norms = np.linalg.norm(rows[:, 4:8], axis=1)
     skewed = np.flatnonzero(np.abs(norms - 1.0) > 1e-2)
     if len(skewed):
         raise InputError(
             f"{path}, line {lines[skewed[0]]}: quaternion of length {norms[skewed[0]]:.4g}, expected a unit "
-            f"quaternion; the format is TUM ({TUM_FORMAT})"
+            f"quaternion; the format is {expected}"
         )
     backwards = np.flatnonzero(np.diff(rows[:, 0]) < 0.0)
     if len(backwards):
         raise InputError(
             f"{path}, line {lines[backwards[0] + 1]}: timestamp is smaller than the one before it; sort the file"
         )
+    flat = np.flatnonzero((rows[:, 8:] <= 0.0).any(axis=1))
+    if len(flat):
+        raise InputError(f"{path}, line {lines[flat[0]]}: {' and '.join(columns)} must be positive")
     world_T_cam = np.tile(np.eye(4), (len(rows), 1, 1))
     world_T_cam[:, :3, :3] = Rotation.from_quat(rows[:, 4:8]).as_matrix()
     world_T_cam[:, :3, 3] = rows[:, 1:4]
-    return Trajectory(rows[:, 0].copy(), world_T_cam)
+    return Trajectory(rows[:, 0].copy(), world_T_cam), rows[:, 8:] if rows.shape[1] > 8 else None
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -80,7 +100,7 @@ def read_kitti(path: Path) -> Trajectory:
         InputError: If the file is missing, a line does not hold 12 finite numbers, or its left 3x3 part is
             not a rotation (to 1e-2); the message names the line.
     """
-    rows, lines = _read_rows(path, 12, f"KITTI ({KITTI_FORMAT})")
+    rows, lines = _read_rows(path, (12,), f"KITTI ({KITTI_FORMAT})")
     world_T_cam = np.tile(np.eye(4), (len(rows), 1, 1))
     world_T_cam[:, :3] = rows.reshape(-1, 3, 4)
     rotation = world_T_cam[:, :3, :3]
@@ -103,8 +123,8 @@ def write_kitti(path: Path, world_T_cam: FloatArray) -> None:
         temporary.write_text(text, encoding="ascii")
 
 
-def _read_rows(path: Path, columns: int, expected: str) -> tuple[FloatArray, list[int]]:
-    """Return the numbers of a text file (N, columns) and each row's line number."""
+def _read_rows(path: Path, counts: tuple[int, ...], expected: str) -> tuple[FloatArray, list[int]]:
+    """Return the numbers of a text file, the same count in every line, and each row's line number."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -115,8 +135,10 @@ def _read_rows(path: Path, columns: int, expected: str) -> tuple[FloatArray, lis
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
-        if len(fields) != columns:
-            raise InputError(f"{path}, line {number}: {len(fields)} columns, expected {columns}: {expected}")
+        allowed = (len(rows[0]),) if rows else counts
+        if len(fields) not in allowed:
+            counted = " or ".join(str(count) for count in allowed)
+            raise InputError(f"{path}, line {number}: {len(fields)} columns, expected {counted}: {expected}")
         try:
             values = [float(field) for field in fields]
         except ValueError as error:

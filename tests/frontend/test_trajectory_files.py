@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.errors import InputError
-from uni4d_fg.results.evaluate.trajectory import Trajectory
-from uni4d_fg.results.evaluate.tum import continuous_quaternions, read_kitti, read_tum, write_tum
+from uni4d_fg.frontend.trajectory_files import continuous_quaternions, read_kitti, read_tum, write_tum
+from uni4d_fg.geometry.trajectory import Trajectory
 
 
 def random_trajectory(seed: int, count: int) -> Trajectory:
