@@ -236,7 +236,7 @@ class Lens:
     def _straight(self, target: FloatArray) -> FloatArray:
         """Invert the polynomial model by Newton's method from the undistorted point."""
         xy = target.copy()
-        moving: BoolArray = np.isfinite(target).all(axis=1)
+        moving: BoolArray = np.asarray(np.isfinite(target).all(axis=1))
         for _ in range(_ITERATIONS):
             rows = np.flatnonzero(moving)
             if not len(rows):

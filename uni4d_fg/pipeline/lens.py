@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
+from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.steps import STOPPED
@@ -108,5 +108,5 @@ def lens_step(
 
 def found_camera(arrays: Mapping[str, npt.NDArray[Any]]) -> CameraModel:
     """Return the camera of a record of :func:`lens_step`."""
-    model = cast(LensModel, list(PARAMETERS)[int(arrays["model"][0])])
+    model = list(PARAMETERS)[int(arrays["model"][0])]
     return CameraModel(Lens.of(model, arrays["parameters"]), arrays["intrinsics"], is_found=True)

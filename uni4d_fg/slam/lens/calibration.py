@@ -20,7 +20,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray, evenly_spread
 from uni4d_fg.config.models import Config
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
-from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
+from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
@@ -101,8 +101,8 @@ def calibrate_lens(
     fit = LensFit(config, some.without(held_out), intrinsics, run, hooks)
     if settings.model != "auto":
         model = cast(LensModel, settings.model.upper())
-        start = given or Lens.of(model, np.zeros(4))
-        found = fit.refine(fit.scene(start, intrinsics), start, model, settings.rounds)
+        lens = _as_model(given or PINHOLE, model)
+        found = fit.refine(fit.scene(lens, intrinsics), lens, model, settings.rounds)
         return LensCalibration(found.lens, found.intrinsics, [_candidate(found, 0.0, image_size)], fit.solves)
 
     pinhole = FittedLens(Lens(), fit.scene(Lens(), intrinsics))
@@ -111,7 +111,7 @@ def calibrate_lens(
         note = f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"
         return LensCalibration(Lens(), intrinsics, [], fit.solves, note)
     judge = HeldOut(config, some.without(~held_out), run, hooks)
-    best, candidates = pinhole, []
+    best, candidates = pinhole, list[LensCandidate]()
     richer: tuple[LensModel, ...] = ("SIMPLE_RADIAL", "RADIAL")
     for model in richer:
         start = best if candidates else fit.search(settings.starts)
@@ -128,6 +128,12 @@ def calibrate_lens(
     if best is pinhole:
         return LensCalibration(Lens(), intrinsics, candidates, fit.solves)
     return LensCalibration(best.lens, best.intrinsics, candidates, fit.solves)
+
+
+def _as_model(lens: Lens, model: LensModel) -> Lens:
+    """Return a lens of a model to start from: with the parameters of another of its family, else with zeros."""
+    same = lens.is_fisheye == (model == "OPENCV_FISHEYE")
+    return Lens.of(model, lens.padded if same else np.zeros(4))
 
 
 def _candidate(fit: FittedLens, held_out_gain: float, image_size: tuple[int, int]) -> LensCandidate:

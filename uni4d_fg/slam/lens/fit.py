@@ -203,7 +203,7 @@ class LensFit:
             ]
         )
         center = np.concatenate([self.prior_intrinsics, np.zeros(4)])
-        return problem.add(prior([0], measured=center[None], log_aspect=[np.log(fx / fy)], sigma=wide[None])), state
+        return problem.add(prior(0, measured=center[None], log_aspect=[np.log(fx / fy)], sigma=wide[None])), state
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class HeldOut:
         ).with_min_observations(3)
         tracks, row = seen.rows()
         landmarks = mean_per_row(lift(seen, cameras), seen.weight, row, len(tracks))
-        known = np.isfinite(landmarks).all(axis=1)
+        known = np.asarray(np.isfinite(landmarks).all(axis=1))
         seen = seen.select(known[row])
         tracks, row = seen.rows()
         out = np.full(len(self.tracks.label), np.nan)
