@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from uni4d_fg.config.load import dump_config, with_overrides
+from uni4d_fg.config.load import dump_config, read_yaml, with_overrides
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
-from uni4d_fg.errors import OutputError
+from uni4d_fg.errors import ConfigError, OutputError
 from uni4d_fg.files import atomic_write_text
 from uni4d_fg.frontend.sequence.model import Sequence as VideoSequence
 from uni4d_fg.frontend.sequence.write import write_native, write_uni4d
@@ -58,8 +56,8 @@ def reuse_or_write_scene(scene: SyntheticSceneConfig, folder: Path) -> bool:
     """
     if (folder / SCENE_FILE).is_file():
         try:
-            known = yaml.safe_load((folder / SCENE_FILE).read_text(encoding="utf-8"))
-        except (yaml.YAMLError, OSError, ValueError):
+            known = read_yaml(folder / SCENE_FILE)
+        except ConfigError:
             known = None
         if known == scene.model_dump(mode="json"):
             return True
