@@ -119,6 +119,16 @@ def check_bit_depth(path: Path, *others: Path) -> None:
         )
 
 
+def is_16_bit_png(path: Path) -> bool:
+    """Tell whether a file begins as a PNG of 16 bits per channel does."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(25)
+    except OSError:
+        return False
+    return start.startswith(_PNG_SIGNATURE) and start[24:] == b"\x10"
+
+
 def clean_depth(depth: npt.NDArray[Any]) -> Float32Array:
     """Return a float32 copy of a depth map (metres) in which zero, negative and infinite values are NaN."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -13,7 +13,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence import assemble, naming
 from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, implausible, load_intrinsics
-from uni4d_fg.frontend.sequence.decode import MIN_16_BIT_RANGE, check_bit_depth
+from uni4d_fg.frontend.sequence.decode import MIN_16_BIT_RANGE, check_bit_depth, is_16_bit_png
 from uni4d_fg.frontend.sequence.frames import FileFrames, ImageFolder, LazyFrames
 from uni4d_fg.frontend.sequence.layout import IMAGE_SUFFIXES, Layout, LayoutOptions, SequenceFiles, list_frames
 from uni4d_fg.frontend.sequence.poses import load_poses, load_timestamps
@@ -108,18 +108,20 @@ class _Validation:
         black: list[int] = []
 
         def visit(frame: int, image: npt.NDArray[np.uint8]) -> None:
-            if int(image.max(initial=0)) < MIN_16_BIT_RANGE // 256:
+            if not isinstance(images, ImageFolder):
+                return
+            if frame == 0:
+                self.findings.attempt("images", lambda: check_bit_depth(*assemble.sampled(images.paths)))
+            if int(image.max(initial=0)) < MIN_16_BIT_RANGE // 256 and is_16_bit_png(images.paths[frame]):
                 black.append(frame)
 
-        if isinstance(images, ImageFolder):
-            self.findings.attempt("images", lambda: check_bit_depth(*assemble.sampled(images.paths)))
         scan_frames("images", images, self.findings, visit)
         if black:
             self.findings.add(
                 "warning",
                 "images",
-                f"{path}: next to black in frame(s) {some_of(black)}",
-                "if these are 16-bit images, scale all by one factor to the whole range",
+                f"{path}: 16-bit images that are next to black in frame(s) {some_of(black)}",
+                "scale all images by one factor to the whole range, unless these are dark",
             )
         if self.findings.items[-1].shape:
             self.size = images.size
