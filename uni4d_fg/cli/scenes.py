@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -45,6 +46,25 @@ def write_scene(scene: SyntheticSceneConfig, folder: Path, layout: str = "native
     return sequence
 
 
+_SCENE_FILES = re.compile(
+    r"scene\.yaml|K\.npy|c2w\.npy|timestamps\.txt|world_T_cam_init\.npy|tracks\.npz|ground_truth\.npz"
+    r"|(depth_cue|depth_gt)\.npy|(rgb|masks|depth_cue|depth_gt)/\d+\.png"
+)
+
+
+def _remove_scene(folder: Path) -> None:
+    """Remove the files of a synthetic scene in the native layout.
+
+    Raises:
+        OutputError: If there is anything else in the folder, or a file cannot be removed.
+    """
+    files = [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]
+    foreign = [path for path in files if not _SCENE_FILES.fullmatch(path.relative_to(folder).as_posix())]
+    if foreign:
+        raise OutputError(f"{foreign[0]}: is not of the scene that is to be replaced; move it or choose another folder")
+    shutil.rmtree(folder)
+
+
 def reuse_or_write_scene(scene: SyntheticSceneConfig, folder: Path) -> bool:
     """Make sure that ``folder`` holds this scene in the native layout; another synthetic scene is replaced.
 
@@ -61,6 +81,6 @@ def reuse_or_write_scene(scene: SyntheticSceneConfig, folder: Path) -> bool:
             known = None
         if known == scene.model_dump(mode="json"):
             return True
-        shutil.rmtree(folder)
+        _remove_scene(folder)
     write_scene(scene, folder)
     return False

@@ -107,9 +107,7 @@ def _name(path: Path, entry: Any, key: str, number: int) -> str:
     return str(value)
 
 
-def _whole(
-    path: Path, entry: Any, key: str, number: int, default: int | None = None, limit: int = _MAX_CLASS
-) -> int:
+def _whole(path: Path, entry: Any, key: str, number: int, default: int | None = None, limit: int = _MAX_CLASS) -> int:
     """Return a whole number of an entry, also where it is written as text."""
     value = default if default is not None and entry.get(key) is None else _entry(path, entry, key, number)
     try:

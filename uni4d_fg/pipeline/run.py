@@ -38,6 +38,7 @@ from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.labels_io import load_labels, save_labels
+from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.windows.plan import Window, windows_of
 
@@ -138,6 +139,18 @@ def reconstruct(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    with run_lock(run_dir):
+        mark_run(run_dir)
+        return _reconstruct(
+            sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False), cues or {},
+            additions,
+        )  # fmt: skip
+
+
+def _reconstruct(
+    sequence: Sequence, run_dir: Path, config: Config, resume: bool, reporter: Reporter,
+    should_stop: Callable[[], bool], cues: dict[str, Any], additions: Iterable[FactorSource],
+) -> RunSummary:  # fmt: skip
     recorder = RecordingRunner(stage_runner(config))
     run_stage = with_additions(recorder, tuple(additions))
     windows = windows_of(config, sequence.num_frames)
@@ -151,12 +164,12 @@ def reconstruct(
             "image_size": [height, width],
         },
         solver_facts(config),
-        cues=cues or {},
-        warnings=list((cues or {}).get("warnings", [])),
+        cues=cues,
+        warnings=list(cues.get("warnings", [])),
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder,
+        reporter, should_stop, summary, recorder,
     )  # fmt: skip
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))

@@ -19,7 +19,9 @@ from uni4d_fg.pipeline.assemble import write_result
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.stream_folder import StreamFolder
+from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
+from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor
@@ -94,11 +96,19 @@ def stream_sequence(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    with run_lock(run_dir):
+        mark_run(run_dir)
+        return _stream(sequence, run_dir, config, resume, on_frame, should_stop)
+
+
+def _stream(
+    sequence: Sequence, run_dir: Path, config: Config, resume: bool, on_frame: OnFrame | None,
+    should_stop: Callable[[], bool] | None,
+) -> StreamSummary:  # fmt: skip
     remove_leftovers(RunFolder(run_dir))
-    folder = StreamFolder(run_dir)
-    folder.remove_leftovers()
+    folder, key = StreamFolder(run_dir), StreamKey(sequence, config)
     solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder)
-    resumed = folder.resume(solver, config) if resume else False
+    resumed = folder.resume(solver, key, should_stop) if resume else False
     if not resumed:
         RunFolder(run_dir).trajectory.unlink(missing_ok=True)
         folder.checkpoint.unlink(missing_ok=True)
@@ -108,12 +118,11 @@ def stream_sequence(
     seconds: dict[str, float] = {}
     for frame in range(first, sequence.num_frames):
         if should_stop is not None and should_stop():
-            folder.save(solver, config)
+            folder.save(solver, key)
             raise Cancelled(f"stopped before frame {frame}; --resume goes on from there")
-        update = solver.add_frame(
-            sequence.images[frame], sequence.depths[frame], sequence.masks[frame], _tracks(sequence, frame),
-            float(sequence.timestamps[frame]),
-        )  # fmt: skip
+        image, depth, mask = sequence.images[frame], sequence.depths[frame], sequence.masks[frame]
+        update = solver.add_frame(image, depth, mask, _tracks(sequence, frame), float(sequence.timestamps[frame]))
+        key.take(image, depth, mask)
         counts[update.status.value] = counts.get(update.status.value, 0) + 1
         for part, value in update.seconds.items():
             seconds[part] = seconds.get(part, 0.0) + value
@@ -121,9 +130,9 @@ def stream_sequence(
             on_frame(update)
         if (frame + 1) % config.incremental.checkpoint_interval == 0:
             since = time.perf_counter()
-            folder.save(solver, config)
+            folder.save(solver, key)
             seconds["checkpoint"] = seconds.get("checkpoint", 0.0) + time.perf_counter() - since
-    folder.save(solver, config)
+    folder.save(solver, key)
     reconstruction = solver.finish()
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began

@@ -84,6 +84,7 @@ def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> Gr
     Raises:
         InputError: If the file cannot be read or a shape does not match the sequence.
     """
+
     def check(shapes: dict[str, tuple[int, ...]]) -> None:
         points = shapes.get("track_points")
         if points is not None and (num_tracks is None or points != (num_tracks, num_frames, 3)):

@@ -45,9 +45,7 @@ def load_native_tracks(path: Path, num_frames: int | None = None) -> RawTracks:
         InputError: If the file cannot be read, or an array is missing or has another rank.
     """
     try:
-        arrays = load_npz(
-            path, {"uv": 3, "visible": 2, "query_frame": 1}, {"confidence": 2}, _spans(path, num_frames)
-        )
+        arrays = load_npz(path, {"uv": 3, "visible": 2, "query_frame": 1}, {"confidence": 2}, _spans(path, num_frames))
     except InputError:
         published = _published(path, num_frames)
         if published is None:
@@ -94,7 +92,9 @@ def _spans(path: Path, num_frames: int | None) -> Callable[[dict[str, tuple[int,
             shape = shapes.get(name, ())
             if len(shape) < 3 or num_frames is None or num_frames in shape[:-1]:
                 continue
-            found = shape[1] if name == "uv" else shape[0] if name == "all_tracks" else " or ".join(map(str, shape[:-1]))
+            found = (
+                shape[1] if name == "uv" else shape[0] if name == "all_tracks" else " or ".join(map(str, shape[:-1]))
+            )
             raise SequenceProblem(
                 path,
                 f"tracks span {found} frames, but the video has {num_frames}",

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from uni4d_fg.config.load import load_config, preset_names, read_yaml
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.results.report.markup import Markup, bullets, element, join, number, section, table
