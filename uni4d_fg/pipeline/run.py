@@ -253,7 +253,9 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
 
 def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> None:
     expected = (run.sequence.num_frames, *run.sequence.image_size)
-    if run.resume and not _readable(lambda: read_depth(run.folder.depth), lambda depth: depth.array.shape == expected):
+    if run.resume and not _readable(
+        lambda: read_depth(run.folder.depth, whole=True), lambda depth: depth.array.shape == expected
+    ):
         run.store.discard("fusion")
 
     def compute(hooks: Hooks) -> StageRecord:

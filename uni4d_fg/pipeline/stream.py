@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
+from uni4d_fg.pipeline.warnings import scene_warnings
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
@@ -42,20 +43,24 @@ class StreamSummary:
     seconds: dict[str, float]
     """Of this process, per part and in all."""
     peak_memory_mb: float
+    doubts: list[str] = field(default_factory=list)
+    """What to distrust in the result, one sentence each."""
+    bridged: int = 0
+    """Frames of the result that were bridged, those of earlier processes too."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         return {
             "sequence": {"name": self.name, "num_frames": self.num_frames},
-            "stages": {"stream": {**self.__dict__, "name": "stream"}},
+            "stages": {"stream": {**{k: v for k, v in self.__dict__.items() if k != "doubts"}, "name": "stream"}},
             "warnings": self.warnings(),
             "versions": versions(),
         }
 
     def warnings(self) -> list[str]:
         """Return what to distrust."""
-        bridged = self.counts.get(FrameStatus.BRIDGED.value, 0)
-        return [f"{bridged} frame(s) had too few static tracks and are bridged by constant velocity"] if bridged else []
+        text = f"{self.bridged} frame(s) had too few static tracks and are bridged by constant velocity"
+        return [*([text] if self.bridged else []), *self.doubts]
 
     def lines(self) -> list[str]:
         """Return a few lines of text."""
@@ -136,7 +141,13 @@ def _stream(
     reconstruction = solver.finish()
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began
-    summary = StreamSummary(sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb())
+    doubts = scene_warnings(
+        sequence.intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks
+    )
+    bridged = sum(frame.status is FrameStatus.BRIDGED for frame in folder.frames())
+    summary = StreamSummary(
+        sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), doubts, bridged
+    )
     atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
     return summary
 
