@@ -253,8 +253,9 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
 
 def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> None:
     expected = (run.sequence.num_frames, *run.sequence.image_size)
+    stored = run.folder.depth
     if run.resume and not _readable(
-        lambda: read_depth(run.folder.depth, whole=True), lambda depth: depth.array.shape == expected
+        lambda: read_depth(stored, whole=True), lambda found: found.array.shape == expected
     ):
         run.store.discard("fusion")
 

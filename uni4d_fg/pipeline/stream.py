@@ -110,10 +110,11 @@ def _stream(
     sequence: Sequence, run_dir: Path, config: Config, resume: bool, on_frame: OnFrame | None,
     should_stop: Callable[[], bool] | None,
 ) -> StreamSummary:  # fmt: skip
-    remove_leftovers(RunFolder(run_dir))
     folder, key = StreamFolder(run_dir), StreamKey(sequence, config)
     solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder)
+    # What is there is touched only when it is known that this goes on from it, or replaces it.
     resumed = folder.resume(solver, key, should_stop) if resume else False
+    remove_leftovers(RunFolder(run_dir))
     if not resumed:
         RunFolder(run_dir).trajectory.unlink(missing_ok=True)
         folder.checkpoint.unlink(missing_ok=True)

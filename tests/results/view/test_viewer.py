@@ -193,7 +193,10 @@ def test_notes_reach_the_panel(finished_run: Path, tmp_path: Path) -> None:
     assert "labels.npz" in notes
 
 
-HOSTILE = '<iframe srcdoc="<script>parent.document.title=\'taken\'</script>"></iframe><img src=x onerror="alert(1)">{alert(1)}'
+HOSTILE = (
+    "<iframe srcdoc=\"<script>parent.document.title='taken'</script>\"></iframe>"
+    '<img src=x onerror="alert(1)">{alert(1)}'
+)
 
 
 def test_text_of_a_run_folder_is_no_markup(finished_run: Path, tmp_path: Path) -> None:

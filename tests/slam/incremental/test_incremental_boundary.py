@@ -126,7 +126,8 @@ BAD: dict[str, list[Any]] = {
     "timestamp": ["now", float("nan"), float("inf"), 10**400, [1.0]],
     "tracks": [
         (np.zeros(0), np.zeros((0, 2))), FrameTracks(np.array([0.5]), np.zeros((1, 2))),
-        FrameTracks(np.array([2**62], np.uint64), np.zeros((1, 2))), FrameTracks(np.array([0]), np.array([[1e30, 0.0]])),
+        FrameTracks(np.array([2**62], np.uint64), np.zeros((1, 2))),
+        FrameTracks(np.array([0]), np.array([[1e30, 0.0]])),
     ],
 }  # fmt: skip
 
@@ -154,8 +155,8 @@ def test_what_is_no_image_size_is_one_clear_error(size: Any) -> None:
 def test_any_small_array_is_refused_or_taken(shape: tuple[int, ...], dtype: str, name: str) -> None:
     solver = IncrementalReconstructor(np.array([5.0, 5.0, 2.0, 2.0]), (4, 5), stream_config())
     good = {
-        "image": np.zeros((4, 5, 3), np.uint8), "depth": np.ones((4, 5), np.float32), "mask": np.zeros((4, 5), np.int32),
-        "tracks": no_tracks(),
+        "image": np.zeros((4, 5, 3), np.uint8), "depth": np.ones((4, 5), np.float32),
+        "mask": np.zeros((4, 5), np.int32), "tracks": no_tracks(),
     }  # fmt: skip
     try:
         solver.add_frame(**{**good, name: np.zeros(shape, dtype)})
