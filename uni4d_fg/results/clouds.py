@@ -66,7 +66,9 @@ def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
     colors = np.asarray(cloud.colors, dtype=np.float64).reshape(-1, 3)
     if colors.shape != points.shape:
         colors = np.ones_like(points)
-    return points, np.rint(colors * 255.0).astype(np.uint8)
+    if not (np.isfinite(points).all() and np.isfinite(colors).all()):
+        raise InputError(f"{path}: has points or colours that are NaN or infinite; make the clouds again")
+    return points, np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def write_clouds(

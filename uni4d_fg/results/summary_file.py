@@ -32,7 +32,7 @@ class _Solve(_Part):
     num_iterations: Count = 0
     num_factors: Count = 0
     num_variables: Count = 0
-    energy_curve: list[tuple[Count, Number]] = []
+    energy_curve: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = []
     notes: dict[str, Any] = {}
 
     @field_validator("energy_curve", mode="before")
