@@ -203,7 +203,8 @@ def load_checksums(path: Path) -> npt.NDArray[np.uint32] | None:
         stream.seek(min(stream.tell() + math.prod(shape) * dtype.itemsize, size))
         # As many as the data has rows at most: what follows the data of a foreign file may be anything.
         tail = stream.read(len(_CRC_MAGIC) + 4 + 4 * max(1, *shape[:1]))
-    numbers: npt.NDArray[np.uint32] = np.frombuffer(tail[len(_CRC_MAGIC) :][: len(tail) // 4 * 4], "<u4")
+    rest = tail[len(_CRC_MAGIC) :]
+    numbers: npt.NDArray[np.uint32] = np.frombuffer(rest[: len(rest) // 4 * 4], "<u4")
     whole = tail.startswith(_CRC_MAGIC) and len(numbers) > 0 and len(numbers) == 1 + int(numbers[0])
     return numbers[1:].astype(np.uint32) if whole else None
 

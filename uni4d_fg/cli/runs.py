@@ -211,6 +211,14 @@ def _is_named_in(root: Path, value: str) -> bool:
     return is_present(root / value) or is_present(root / f"{value}.npy") or not is_present(expanded(value))
 
 
+def _is_there(name: str) -> bool:
+    """Tell whether a path that was written down leads anywhere; one that cannot exist does not."""
+    try:
+        return is_present(Path(name))
+    except InputError:
+        return False
+
+
 def _beside(root: Path, value: str) -> Path:
     """Return the file of that name in the sequence folder, if there is one, else the path as it is."""
     inside = root / value
@@ -265,7 +273,7 @@ def _check_same_video(folder: Path, source: SequenceInput, whole: bool) -> None:
     except InputError as error:
         raise OutputError(f"{error}; what the run was made from is not known: replace it with --overwrite") from error
     names = [f.name for f in fields(SequenceInput) if f.compare and (whole or f.name in _SAME_VIDEO)]
-    moved = not Path(stored.root).exists() and Path(stored.root).name == Path(source.root).name
+    moved = not _is_there(stored.root) and Path(stored.root).name == Path(source.root).name
     changed = [n for n in names if getattr(stored, n) != getattr(source, n) and not (n == "root" and moved)]
     if changed:
         was = ", ".join(f"{name} {getattr(stored, name)}" for name in changed)
@@ -294,6 +302,6 @@ def stored_input(folder: Path) -> SequenceInput:
     if not result.root:
         raise InputError(f"{folder}: does not say which sequence it was made from; give it with --sequence")
     own = folder / DEMO_SEQUENCE
-    if not Path(result.root).exists() and own.is_dir():
+    if not _is_there(result.root) and own.is_dir():
         return SequenceInput(str(own))
     return replace(result, cues=str(folder / CUE_FOLDER))

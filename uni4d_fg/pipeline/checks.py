@@ -34,7 +34,7 @@ def check_sequence(sequence: Sequence) -> None:
     if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
         raise SequenceProblem(
             where,
-            f"intrinsics {intrinsics.tolist()} are not fx, fy, cx, cy with positive focal lengths",
+            f"intrinsics {intrinsics.tolist() if intrinsics.size <= 4 else intrinsics.shape} are not fx, fy, cx, cy with positive focal lengths",
             "give (4,) pixels",
         )
     times = sequence.timestamps
