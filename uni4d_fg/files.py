@@ -347,7 +347,9 @@ def _array_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], np.dt
         else:
             raise InputError(f"{where}: .npy format version {version} is not supported; save a plain array")
     except _BROKEN_HEADER as error:
-        raise InputError(f"{where}: its header is not that of a .npy array ({type(error).__name__}); write it again") from error
+        raise InputError(
+            f"{where}: its header is not that of a .npy array ({type(error).__name__}); write it again"
+        ) from error
     if dtype.hasobject:
         raise InputError(
             f"{where}: holds Python objects, which are not loaded because reading them can run code; "

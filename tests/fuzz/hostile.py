@@ -18,9 +18,15 @@ from uni4d_fg.cli import main
 from uni4d_fg.errors import Uni4dFgError
 
 TINY_SCENE: dict[str, Any] = {
-    "num_frames": 6, "height": 60, "width": 80, "focal": 75.0, "margin_px": 3.0, "grid_columns": 14, "grid_rows": 10,
+    "num_frames": 6,
+    "height": 60,
+    "width": 80,
+    "focal": 75.0,
+    "margin_px": 3.0,
+    "grid_columns": 14,
+    "grid_rows": 10,
     "query_interval": 4,
-}  # fmt: skip
+}
 
 SECONDS = 20
 """A case that takes longer hangs."""
@@ -96,15 +102,22 @@ def state_of(folder: Path) -> dict[str, bytes]:
 
 
 SCALARS: st.SearchStrategy[Any] = st.one_of(
-    st.none(), st.booleans(), st.integers(-3, 300), st.sampled_from([2**31, 2**40, 2**63, 2**64, -(2**63), 10**30]),
-    st.floats(allow_nan=False), st.text(max_size=8),
-    st.sampled_from(["../../etc/passwd", "/dev/zero", "~nosuchuser/x", "x" * 300, "\x00", "<script>", "\udcff", "1e999"]),
-)  # fmt: skip
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 300),
+    st.sampled_from([2**31, 2**40, 2**63, 2**64, -(2**63), 10**30]),
+    st.floats(allow_nan=False),
+    st.text(max_size=8),
+    st.sampled_from(
+        ["../../etc/passwd", "/dev/zero", "~nosuchuser/x", "x" * 300, "\x00", "<script>", "\udcff", "1e999"]
+    ),
+)
 
 JSON = st.recursive(
-    SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
     max_leaves=8,
-)  # fmt: skip
+)
 
 
 @st.composite

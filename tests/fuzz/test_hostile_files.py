@@ -126,9 +126,13 @@ def test_videos(video_file: Path, data: st.DataObject) -> None:
 
 
 LISTS = [
-    b"ffconcat version 1.0\nfile {}\n", b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{}\n#EXT-X-ENDLIST\n",
-    b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nm=video 5004 RTP/AVP 96\n", b"<?xml version='1.0'?><MPD></MPD>", b"GIF89a", b"\0",
-]  # fmt: skip
+    b"ffconcat version 1.0\nfile {}\n",
+    b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{}\n#EXT-X-ENDLIST\n",
+    b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nm=video 5004 RTP/AVP 96\n",
+    b"<?xml version='1.0'?><MPD></MPD>",
+    b"GIF89a",
+    b"\0",
+]
 
 
 @pytest.mark.parametrize("number", range(len(LISTS)))
@@ -141,7 +145,11 @@ def test_a_list_of_files_is_no_video(video_file: Path, tmp_path: Path, number: i
 
 
 @hostile
-@given(text=st.one_of(st.text(max_size=60), JSON.map(lambda value: json.dumps(value)), st.text("[]{}&*:,- \n'\"!x1", max_size=60)))
+@given(
+    text=st.one_of(
+        st.text(max_size=60), JSON.map(lambda value: json.dumps(value)), st.text("[]{}&*:,- \n'\"!x1", max_size=60)
+    )
+)
 def test_configurations(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     path = tmp_path_factory.getbasetemp() / "hostile.yaml"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
@@ -152,7 +160,8 @@ def test_configurations(tmp_path_factory: pytest.TempPathFactory, text: str) -> 
 
 
 YAML_BOMBS = {
-    "aliases": "a: &a [x, x]\n" + "".join(f"{c}: &{c} [*{p}, *{p}, *{p}]\n" for p, c in zip("abcdefghijk", "bcdefghijkl", strict=True)),
+    "aliases": "a: &a [x, x]\n"
+    + "".join(f"{c}: &{c} [*{p}, *{p}, *{p}]\n" for p, c in zip("abcdefghijk", "bcdefghijkl", strict=True)),
     "anchor": "a: &a [*a]",
     "merge": "a: &a {b: 1}\nc:\n  <<: *a",
     "brackets": "a: " + "[" * 400 + "]" * 400,
@@ -171,7 +180,7 @@ YAML_BOMBS = {
     "keys": "? [a]\n: 1",
     "documents": "a: 1\n---\nb: 2",
     "bad date": "a: 2020-13-45",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", list(YAML_BOMBS))
@@ -225,10 +234,11 @@ def test_coco(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> 
 @hostile
 @given(
     counts=st.one_of(
-        st.lists(st.sampled_from([0, 1, 5, 6912, -1, 2**31, 2**63 - 1, 2**63, 2**64, True]), max_size=6), st.text(max_size=20)
+        st.lists(st.sampled_from([0, 1, 5, 6912, -1, 2**31, 2**63 - 1, 2**63, 2**64, True]), max_size=6),
+        st.text(max_size=20),
     ),
     size=st.sampled_from([list(SIZE), [2**31, 2**32], [1, 1], [0, 5], [True, 5], [72.0, 96.0]]),
-)  # fmt: skip
+)
 def test_run_lengths(tmp_path_factory: pytest.TempPathFactory, counts: Any, size: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "runs.json"
     path.write_text(json.dumps([{**MASK, "segmentation": {"size": size, "counts": counts}}]))
@@ -241,10 +251,14 @@ def test_run_lengths(tmp_path_factory: pytest.TempPathFactory, counts: Any, size
         {"segmentation": {"size": list(SIZE), "counts": [2**63 - 1, 2**63 - 1, 6914]}},
         {"segmentation": {"size": [2**20, 2**20], "counts": [2**40]}},
         {"segmentation": {"size": list(SIZE), "counts": "o" * 30}},
-        {"track_id": 1e400}, {"track_id": "text"}, {"category_id": 2**40}, {"category_id": None, "image_id": None},
-        {"score": 1e400}, {"score": "high"},
+        {"track_id": 1e400},
+        {"track_id": "text"},
+        {"category_id": 2**40},
+        {"category_id": None, "image_id": None},
+        {"score": 1e400},
+        {"score": "high"},
     ],
-)  # fmt: skip
+)
 def test_coco_that_is_wrong_is_one_clear_error(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "masks.json"
     path.write_text(json.dumps([{**MASK, **change}]))
@@ -290,7 +304,17 @@ def special_files(folder: Path) -> list[Path]:
     return [pipe, loop, nowhere, plug, Path("/dev/zero"), Path("/dev/null"), folder]
 
 
-ITEMS = ["rgb", "K.npy", "depth_cue", "masks", "tracks.npz", "timestamps.txt", "c2w.npy", "ground_truth.npz", "rgb/00002.png"]
+ITEMS = [
+    "rgb",
+    "K.npy",
+    "depth_cue",
+    "masks",
+    "tracks.npz",
+    "timestamps.txt",
+    "c2w.npy",
+    "ground_truth.npz",
+    "rgb/00002.png",
+]
 
 
 @pytest.mark.parametrize("item", ITEMS)
@@ -319,7 +343,9 @@ def test_a_dangling_calibration_is_not_an_absent_one(sequence_folder: Path, tmp_
     assert "is a link to elsewhere.npy, where there is nothing" in str(error)
 
 
-@pytest.mark.parametrize("options", [["--masks"], ["--depth"], ["--tracks"], ["--intrinsics"], ["--config"], ["--depth-model"]])
+@pytest.mark.parametrize(
+    "options", [["--masks"], ["--depth"], ["--tracks"], ["--intrinsics"], ["--config"], ["--depth-model"]]
+)
 def test_pipes_devices_and_links_as_options(sequence_folder: Path, tmp_path: Path, options: list[str]) -> None:
     for special in special_files(tmp_path)[:-1]:
         words = ["reconstruct", sequence_folder, *options, special, "--out", tmp_path / "run"]

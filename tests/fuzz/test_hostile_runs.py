@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile import SCALARS, changed_json, damaged, judged, judged_verb, state_of
+from hostile import changed_json, damaged, judged, judged_verb, state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,8 +29,12 @@ hostile = settings(settings.get_profile("hostile"))
 slower = settings(hostile, max_examples=max(1, hostile.max_examples // 4))
 
 VERBS: list[list[Any]] = [
-    ["report"], ["evaluate"], ["graph"], ["export", "--to", "tum", "--overwrite"], ["export", "--to", "colmap", "--overwrite"],
-]  # fmt: skip
+    ["report"],
+    ["evaluate"],
+    ["graph"],
+    ["export", "--to", "tum", "--overwrite"],
+    ["export", "--to", "colmap", "--overwrite"],
+]
 
 
 @slower
@@ -41,10 +45,18 @@ def test_damaged_runs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory
     shutil.copytree(run_folder, run)
     name = data.draw(
         st.sampled_from(
-            ["summary.json", "input.json", "config.yaml", "reconstruction.npz", "labels.npz", "depth.npy",
-             "clouds/static.ply", "graphs/bundle_adjustment.graph.npz"]
+            [
+                "summary.json",
+                "input.json",
+                "config.yaml",
+                "reconstruction.npz",
+                "labels.npz",
+                "depth.npy",
+                "clouds/static.ply",
+                "graphs/bundle_adjustment.graph.npz",
+            ]
         )
-    )  # fmt: skip
+    )
     path = run / name
     if path.suffix == ".json" and data.draw(st.booleans()):
         path.write_text(json.dumps(data.draw(changed_json(json.loads(path.read_text())))))
@@ -76,12 +88,23 @@ def test_summaries_and_inputs(run_folder: Path, tmp_path_factory: pytest.TempPat
 @pytest.mark.parametrize(
     "change",
     [
-        {"stages": []}, {"stages": {"x": 5}}, {"stages": {"x": {"solves": [5]}}}, {"stages": {"x": {"seconds": "long"}}},
-        {"stages": {"x": {"solves": [{"energy_curve": [[0, None], [1, "a"]]}]}}}, {"warnings": "text"}, {"warnings": [5]},
-        {"sequence": 5}, {"sequence": {"name": ["a"]}}, {"cues": {"sources": []}}, {"cues": {"facts": 3}}, {"solver": 3},
-        {"versions": [1]}, {"stages": {"x": {"peak_memory_mb": 1e400}}}, {"stages": {"x": {"dropped": {"a": "b"}}}},
+        {"stages": []},
+        {"stages": {"x": 5}},
+        {"stages": {"x": {"solves": [5]}}},
+        {"stages": {"x": {"seconds": "long"}}},
+        {"stages": {"x": {"solves": [{"energy_curve": [[0, None], [1, "a"]]}]}}},
+        {"warnings": "text"},
+        {"warnings": [5]},
+        {"sequence": 5},
+        {"sequence": {"name": ["a"]}},
+        {"cues": {"sources": []}},
+        {"cues": {"facts": 3}},
+        {"solver": 3},
+        {"versions": [1]},
+        {"stages": {"x": {"peak_memory_mb": 1e400}}},
+        {"stages": {"x": {"dropped": {"a": "b"}}}},
     ],
-)  # fmt: skip
+)
 def test_a_summary_of_other_types_is_refused(run_folder: Path, tmp_path: Path, change: dict[str, Any]) -> None:
     whole = json.loads((run_folder / "summary.json").read_text())
     (tmp_path / "summary.json").write_text(json.dumps({**whole, **change}))
@@ -94,19 +117,62 @@ def test_a_whole_summary_reads_back_as_it_was_written(run_folder: Path) -> None:
 
 WORDS = st.one_of(
     st.sampled_from(
-        ["--start", "--stop", "--stride", "--max-size", "--set", "--config", "--masks", "--depth", "--tracks", "--window",
-         "--resume", "--overwrite", "--layout", "--json", "--quiet", "--intrinsics", "--depth-model", "--classes", "--out"]
+        [
+            "--start",
+            "--stop",
+            "--stride",
+            "--max-size",
+            "--set",
+            "--config",
+            "--masks",
+            "--depth",
+            "--tracks",
+            "--window",
+            "--resume",
+            "--overwrite",
+            "--layout",
+            "--json",
+            "--quiet",
+            "--intrinsics",
+            "--depth-model",
+            "--classes",
+            "--out",
+        ]
     ),
     st.sampled_from(
-        ["0", "-1", str(10**400), "nan", "~nosuchuser", "/dev/null", "/dev/zero", "/", ".", "none", "motion", "x" * 300,
-         "native", "uni4d", "fast", "camera_init.window=1e999", "depth_pro=/dev/zero", "\udcff", "tracking=", "=", ""]
+        [
+            "0",
+            "-1",
+            str(10**400),
+            "nan",
+            "~nosuchuser",
+            "/dev/null",
+            "/dev/zero",
+            "/",
+            ".",
+            "none",
+            "motion",
+            "x" * 300,
+            "native",
+            "uni4d",
+            "fast",
+            "camera_init.window=1e999",
+            "depth_pro=/dev/zero",
+            "\udcff",
+            "tracking=",
+            "=",
+            "",
+        ]
     ),
     st.text(max_size=5),
-)  # fmt: skip
+)
 
 
 @hostile
-@given(verb=st.sampled_from(["validate", "config", "evaluate", "report", "export", "graph", "synthesize", "track"]), words=st.lists(WORDS, max_size=5))
+@given(
+    verb=st.sampled_from(["validate", "config", "evaluate", "report", "export", "graph", "synthesize", "track"]),
+    words=st.lists(WORDS, max_size=5),
+)
 def test_any_words(tmp_path_factory: pytest.TempPathFactory, verb: str, words: list[str]) -> None:
     folder = tmp_path_factory.getbasetemp() / "working"
     folder.mkdir(exist_ok=True)
@@ -120,7 +186,9 @@ def test_any_words(tmp_path_factory: pytest.TempPathFactory, verb: str, words: l
 
 @slower
 @given(words=st.lists(WORDS, max_size=5))
-def test_any_words_with_a_sequence(sequence_folder: Path, tmp_path_factory: pytest.TempPathFactory, words: list[str]) -> None:
+def test_any_words_with_a_sequence(
+    sequence_folder: Path, tmp_path_factory: pytest.TempPathFactory, words: list[str]
+) -> None:
     run = tmp_path_factory.getbasetemp() / "any-words"
     shutil.rmtree(run, ignore_errors=True)
     before = state_of(sequence_folder)
@@ -131,7 +199,16 @@ def test_any_words_with_a_sequence(sequence_folder: Path, tmp_path_factory: pyte
 
 def test_enormous_numbers(sequence_folder: Path, tmp_path: Path) -> None:
     for option in ("--start", "--stop", "--stride", "--max-size"):
-        words = ["reconstruct", sequence_folder, option, 10**400, "--out", tmp_path / "run", "--set", "output.pictures=false"]
+        words = [
+            "reconstruct",
+            sequence_folder,
+            option,
+            10**400,
+            "--out",
+            tmp_path / "run",
+            "--set",
+            "output.pictures=false",
+        ]
         if option in ("--start", "--stride"):
             assert judged_verb(*words)[0] == 3
 
@@ -149,10 +226,19 @@ def test_a_foreign_folder_is_no_run(sequence_folder: Path, tmp_path: Path) -> No
 
 
 FOREIGN = (
-    "thesis.txt", "clouds/mine.ply", "clouds/dynamic/holiday.jpg", "pictures/cat.png", "stages/notes.txt",
-    "stages/windows/notes.txt", "export/notes.txt", "export/colmap/mine.txt", "export/tum/photos/a.jpg",
-    "graphs/mine.dot", "cues/mine.npy", ".tmp-0a0a0a0a-notes.txt",
-)  # fmt: skip
+    "thesis.txt",
+    "clouds/mine.ply",
+    "clouds/dynamic/holiday.jpg",
+    "pictures/cat.png",
+    "stages/notes.txt",
+    "stages/windows/notes.txt",
+    "export/notes.txt",
+    "export/colmap/mine.txt",
+    "export/tum/photos/a.jpg",
+    "graphs/mine.dot",
+    "cues/mine.npy",
+    ".tmp-0a0a0a0a-notes.txt",
+)
 
 
 def test_files_of_others_in_a_run_stay(run_folder: Path, tmp_path: Path) -> None:
@@ -188,7 +274,17 @@ def test_the_list_of_an_export_reaches_no_further_than_its_folder(tmp_path: Path
 
 
 def test_a_run_that_died_before_it_was_marked_does_not_stand_in_the_way(sequence_folder: Path, tmp_path: Path) -> None:
-    words = ["reconstruct", sequence_folder, "--stop", "3", "--config", "fast", "--quiet", "--set", "output.pictures=false"]
+    words = [
+        "reconstruct",
+        sequence_folder,
+        "--stop",
+        "3",
+        "--config",
+        "fast",
+        "--quiet",
+        "--set",
+        "output.pictures=false",
+    ]
     for left in ((".tmp-0a0a0a0a-run.json",), (".tmp-0a0a0a0a-input.json", "run.json")):
         for option in ([], ["--resume"], ["--overwrite"]):
             run = tmp_path / f"{len(left)}{''.join(option)}"
@@ -250,7 +346,10 @@ def test_two_processes_do_not_write_into_one_folder(tmp_path: Path, sequence_fol
         process.kill()
     with run_lock(tmp_path / "run"), run_lock(tmp_path / "run"):
         pass
-    with pytest.raises(OutputError, match="File exists|is a file|Not a directory"), run_lock(sequence_folder / "K.npy"):
+    with (
+        pytest.raises(OutputError, match=r"File exists|is a file|Not a directory"),
+        run_lock(sequence_folder / "K.npy"),
+    ):
         pass
 
 

@@ -35,9 +35,12 @@ def test_a_full_standard_output() -> None:
 
 def test_a_reader_that_goes_away() -> None:
     done = subprocess.run(
-        ["bash", "-c", f"{sys.executable} -m uni4d_fg.cli.entry config --all | head -n 1"], capture_output=True, text=True,
-        timeout=60, check=False,
-    )  # fmt: skip
+        ["bash", "-c", f"{sys.executable} -m uni4d_fg.cli.entry config --all | head -n 1"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert "Traceback" not in done.stderr
 
 
@@ -93,13 +96,19 @@ def test_little_memory_is_not_taken_for_a_missing_library(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("error", "kind"),
     [
-        (KeyboardInterrupt(), Cancelled), (MemoryError(), InputError), (BrokenPipeError(32, "Broken pipe"), OutputError),
-        (PermissionError(13, "Permission denied", "/root/x"), InputError), (OSError(28, "No space left", "/x"), OutputError),
-        (OSError(36, "File name too long", "x" * 300), InputError), (OSError(40, "Too many levels", "loop"), InputError),
-        (OSError(24, "Too many open files", "x"), OutputError), (FileNotFoundError(2, "No such file"), InputError),
-        ("\udcff".encode, InputError), (ZeroDivisionError(), type(None)),
+        (KeyboardInterrupt(), Cancelled),
+        (MemoryError(), InputError),
+        (BrokenPipeError(32, "Broken pipe"), OutputError),
+        (PermissionError(13, "Permission denied", "/root/x"), InputError),
+        (OSError(28, "No space left", "/x"), OutputError),
+        (OSError(36, "File name too long", "x" * 300), InputError),
+        (OSError(40, "Too many levels", "loop"), InputError),
+        (OSError(24, "Too many open files", "x"), OutputError),
+        (FileNotFoundError(2, "No such file"), InputError),
+        ("\udcff".encode, InputError),
+        (ZeroDivisionError(), type(None)),
     ],
-)  # fmt: skip
+)
 def test_failures_of_the_system_are_known(error: Any, kind: type) -> None:
     if callable(error):
         try:
@@ -129,7 +138,9 @@ def test_links_that_lead_in_a_circle_and_unknown_users(tmp_path: Path, sequence_
         assert code == 3
         assert "leads in a circle" in out + err
     for option in ("--masks", "--depth", "--depth-model", "--mask-model"):
-        code, _, err = judged_verb("reconstruct", sequence_folder, option, "~nosuchuser/x.yaml", "--out", tmp_path / "run")
+        code, _, err = judged_verb(
+            "reconstruct", sequence_folder, option, "~nosuchuser/x.yaml", "--out", tmp_path / "run"
+        )
         assert code in (2, 3)
         assert "no such user" in err
     assert judged_verb("validate", tmp_path / ("x" * 300))[0] == 3

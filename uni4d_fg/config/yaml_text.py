@@ -30,7 +30,7 @@ class _PlainLoader(yaml.SafeLoader):
         self._depth = self._values = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        event = self.peek_event()
+        event = self.peek_event()  # type: ignore[no-untyped-call]
         self._values += 1
         self._depth += 1
         if self.check_event(yaml.AliasEvent) or getattr(event, "anchor", None) is not None:

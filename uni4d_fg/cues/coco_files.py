@@ -89,7 +89,9 @@ def _burst(path: Path, frames: list[Any]) -> CocoContent:
     for n, frame in enumerate(frames):
         stem = Path(_name(path, frame, "file_name", n)).stem
         segments = _listed(path, frame, "segmentations")
-        masks[stem] = [_mask(path, segment, _entry(path, segment, "rle", m), m, "id") for m, segment in enumerate(segments)]
+        masks[stem] = [
+            _mask(path, segment, _entry(path, segment, "rle", m), m, "id") for m, segment in enumerate(segments)
+        ]
     return CocoContent(masks, {stem: stem for stem in masks})
 
 

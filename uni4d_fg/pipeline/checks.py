@@ -31,10 +31,11 @@ def check_sequence(sequence: Sequence) -> None:
         if found != count:
             raise SequenceProblem(where, f"has {found} {name}, but there are {count} images", "give one per image")
     intrinsics = sequence.intrinsics
+    shown = intrinsics.tolist() if intrinsics.size <= 4 else intrinsics.shape
     if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
         raise SequenceProblem(
             where,
-            f"intrinsics {intrinsics.tolist() if intrinsics.size <= 4 else intrinsics.shape} are not fx, fy, cx, cy with positive focal lengths",
+            f"intrinsics {shown} are not fx, fy, cx, cy with positive focal lengths",
             "give (4,) pixels",
         )
     times = sequence.timestamps

@@ -13,7 +13,8 @@ from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.frame_checks import checked_image, checked_mask, floating_depth
 from uni4d_fg.frontend.sequence.model import Sequence
 
-_CHECKS = {"image": checked_image, "depth": floating_depth, "mask": checked_mask}
+_Check = Callable[[Any, tuple[int, int], str], np.ndarray]
+_CHECKS: dict[str, _Check] = {"image": checked_image, "depth": floating_depth, "mask": checked_mask}
 
 ALGORITHM_VERSION = 2
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""
