@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hostile import changed_json, damaged, judged, judged_verb, state_of
 from hypothesis import given, settings
@@ -20,7 +17,6 @@ from hypothesis import strategies as st
 
 from uni4d_fg.cli.runs import stored_input
 from uni4d_fg.errors import InputError, OutputError
-from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.run_contents import is_run, mark_run, remove_results, run_lock
 from uni4d_fg.results.summary_file import read_summary
@@ -363,34 +359,3 @@ def test_a_lock_is_not_shared_with_another_thread(tmp_path: Path) -> None:
     with run_lock(tmp_path), ThreadPoolExecutor(1) as pool:
         assert isinstance(judged(pool.submit(enter).result), OutputError)
     enter()
-
-
-KILLED = Path(__file__).parents[1] / "pipeline" / "pipeline_killed.py"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("windowed", [False, True])
-def test_kills_at_random_moments(tmp_path: Path, sequence_folder: Path, windowed: bool) -> None:
-    from uni4d_fg.config.load import load_config
-    from uni4d_fg.frontend.sequence.read import read_sequence
-
-    config = load_config("fast", ["windows.frames=4", "windows.overlap=2"] if windowed else [])
-    sequence = read_sequence(sequence_folder)
-    reconstruct(sequence, tmp_path / "whole", config)
-    work = tmp_path / "work.pickle"
-    work.write_bytes(pickle.dumps((sequence, config)))
-    rng = np.random.default_rng(int(os.environ.get("UNI4D_FG_SEED", "0")))
-    cases = [f"write:{n}" for n in rng.choice(np.arange(1, 28), 15, replace=False)]
-    cases += [f"poll:{n}" for n in rng.choice(np.arange(1, 60), 15, replace=False)]
-    cases += [f"seconds:{s:.2f}" for s in rng.uniform(0.05, 2.5, 10)]
-    command = [sys.executable, str(KILLED), str(work), str(tmp_path), *cases]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert said.count(f" {signal.SIGKILL.value}\n") > 20
-    wanted = state_of(tmp_path / "whole")
-    for case in cases:
-        run = tmp_path / case.replace(":", "-")
-        reconstruct(sequence, run, config, resume=True)
-        found = state_of(run)
-        assert set(found) == set(wanted)
-        for name in found:
-            assert name == "summary.json" or found[name] == wanted[name], (case, name)
