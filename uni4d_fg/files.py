@@ -11,7 +11,7 @@ import shutil
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path, PurePath
@@ -21,9 +21,16 @@ import numpy as np
 import numpy.typing as npt
 
 from uni4d_fg.errors import InputError, OutputError
+from uni4d_fg.reading import check_regular, read_failure
 
 MAX_NPZ_BYTES = 16 * 1024**3
-"""Uncompressed size above which an .npz file is refused."""
+"""Uncompressed size above which an array file is refused, unless it is mapped into memory."""
+
+MAX_RATIO, FREE_BYTES = 200, 256 * 1024**2
+"""An .npz that unpacks to more than so many times its size is refused, beyond that many bytes."""
+
+_CRC_MAGIC = b"\nU4DCRC1"
+"""Begins what follows the data of a .npy file with checksums: a count and CRC-32 numbers of equal parts of the data."""
 
 _BROKEN_ARCHIVE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, OSError, RuntimeError)
 
@@ -157,8 +164,13 @@ def atomic_write_json(path: Path, value: Any) -> None:
     atomic_write_text(path, json_text(value) + "\n")
 
 
-def save_npy(path: Path, array: npt.ArrayLike) -> None:
+def save_npy(path: Path, array: npt.ArrayLike, *, checksum: bool = False) -> None:
     """Write one array to ``path`` (``.npy``), whole or not at all.
+
+    Args:
+        path: The file.
+        array: Numbers, booleans or text.
+        checksum: Write a checksum behind the data, where numpy does not look; :func:`load_npy` does.
 
     Raises:
         OutputError: If it cannot be written.
@@ -169,6 +181,32 @@ def save_npy(path: Path, array: npt.ArrayLike) -> None:
         raise ValueError(f"{path}: an object array cannot be saved without pickle")
     with atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.lib.format.write_array(stream, values, allow_pickle=False)
+        if checksum:
+            write_checksums(stream, [zlib.crc32(np.ascontiguousarray(values).data)])
+
+
+def write_checksums(stream: IO[bytes], checksums: Iterable[int]) -> None:
+    """Write CRC-32 numbers of equal parts of the data of a ``.npy`` file (its rows, or all) behind the data."""
+    numbers = np.array(list(checksums), dtype="<u4")
+    stream.write(_CRC_MAGIC + np.array(len(numbers), "<u4").tobytes() + numbers.tobytes())
+
+
+def load_checksums(path: Path) -> npt.NDArray[np.uint32] | None:
+    """Return the CRC-32 numbers behind the data of a ``.npy`` file, (N,), or None if it has none that are whole.
+
+    Raises:
+        InputError: If the file is missing or not a ``.npy`` file.
+    """
+    size = check_regular(path, "a .npy file")
+    with _open_to_read(path) as stream:
+        shape, dtype = _array_header(stream, f"{path}")
+        stream.seek(min(stream.tell() + math.prod(shape) * dtype.itemsize, size))
+        # As many as the data has rows at most: what follows the data of a foreign file may be anything.
+        tail = stream.read(len(_CRC_MAGIC) + 4 + 4 * max(1, *shape[:1]))
+    rest = tail[len(_CRC_MAGIC) :]
+    numbers: npt.NDArray[np.uint32] = np.frombuffer(rest[: len(rest) // 4 * 4], "<u4")
+    whole = tail.startswith(_CRC_MAGIC) and len(numbers) > 0 and len(numbers) == 1 + int(numbers[0])
+    return numbers[1:].astype(np.uint32) if whole else None
 
 
 def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
@@ -188,13 +226,6 @@ def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
                 np.lib.format.write_array(stream, array, allow_pickle=False)
 
 
-def _readable_file(path: Path, what: str) -> None:
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, but {what} file is expected here")
-    if not path.exists():
-        raise InputError(f"{path}: no such file; {what} file is expected here")
-
-
 def load_npy(path: Path, *, memory_map: bool = False) -> npt.NDArray[Any]:
     """Read one numeric or boolean array of any shape from a ``.npy`` file.
 
@@ -203,9 +234,10 @@ def load_npy(path: Path, *, memory_map: bool = False) -> npt.NDArray[Any]:
         memory_map: Map the file read-only instead of reading it, so that only what is used is loaded.
 
     Raises:
-        InputError: If the file is missing, truncated, not a ``.npy`` file, or its dtype is not numeric.
+        InputError: If the file is missing, truncated, not a ``.npy`` file, its dtype is not numeric, or, where it is
+            read as a whole, it has a checksum that its data does not fit.
     """
-    _readable_file(path, "a .npy")
+    check_regular(path, "a .npy file")
     with _open_to_read(path) as stream:
         if stream.read(6) != np.lib.format.MAGIC_PREFIX:
             raise InputError(f"{path}: not a .npy file (or cut short); write it with numpy.save")
@@ -215,17 +247,25 @@ def load_npy(path: Path, *, memory_map: bool = False) -> npt.NDArray[Any]:
         _check_size(shape, dtype, size - stream.tell(), f"{path}")
     if dtype.kind not in "biuf":
         raise InputError(f"{path}: dtype {dtype} is not numeric; write it again as numbers")
+    if not memory_map and math.prod(shape) * dtype.itemsize > MAX_NPZ_BYTES:
+        raise InputError(f"{path}: an array of shape {shape} takes more than {MAX_NPZ_BYTES // 1024**3} GiB; split it")
     try:
         array: npt.NDArray[Any] = np.load(path, mmap_mode="r" if memory_map and 0 not in shape else None)
     except (ValueError, OSError, EOFError) as error:
         raise InputError(f"{path}: cannot be read as a .npy file ({error}); write it again") from error
     except MemoryError as error:
         raise InputError(f"{path}: an array of shape {shape} does not fit into memory") from error
+    checksums = None if memory_map else load_checksums(path)
+    if checksums is not None and len(checksums) == 1 and zlib.crc32(np.ascontiguousarray(array).data) != checksums[0]:
+        raise InputError(f"{path}: is damaged, its checksum does not fit its data; make it again")
     return array
 
 
 def load_npz(
-    path: Path, required: Mapping[str, int | None], optional: Mapping[str, int | None] | None = None
+    path: Path,
+    required: Mapping[str, int | None],
+    optional: Mapping[str, int | None] | None = None,
+    check: Callable[[dict[str, tuple[int, ...]]], None] | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
     """Read arrays from an ``.npz`` file that may come from anywhere; nothing in it is executed.
 
@@ -234,15 +274,17 @@ def load_npz(
         required: Name to number of dimensions of the arrays that must be present. With a number the array
             must be numeric or boolean; with None it may have any rank and may hold strings.
         optional: The same for arrays that may be absent. None reads whatever else the file holds.
+        check: Told the shapes of the arrays that are about to be read, before any of them is; raises to refuse them.
 
     Returns:
         Name to array: the required ones and those optional ones that are present.
 
     Raises:
         InputError: If the file is missing, truncated or not an ``.npz``, if an array is missing, has another
-            rank, or is an object array, or if the arrays would take more than 16 GiB.
+            rank, or is an object array, or if the arrays would take more than 16 GiB, or far more than data of that
+            size on disk.
     """
-    _readable_file(path, "an .npz")
+    size = check_regular(path, "an .npz file")
     ranks = {**(optional or {}), **required}
     try:
         with zipfile.ZipFile(path) as archive:
@@ -264,6 +306,13 @@ def load_npz(
                     f"{path}: would take {declared / 1024**3:.1f} GiB when unpacked, more than "
                     f"{MAX_NPZ_BYTES // 1024**3} GiB; store large arrays as .npy instead"
                 )
+            if declared > max(FREE_BYTES, MAX_RATIO * size):
+                raise InputError(
+                    f"{path}: {size} bytes would unpack to {declared / 1024**2:.0f} MiB, as real data hardly does; "
+                    "write it again with numpy.savez, uncompressed"
+                )
+            if check is not None:
+                check({name: _member_header(archive, members[name], path)[0] for name in wanted})
             return {name: _read_member(archive, members[name], path, ranks.get(name)) for name in wanted}
     except InputError:
         raise
@@ -282,7 +331,7 @@ def _open_to_read(path: Path) -> Iterator[IO[bytes]]:
     try:
         stream = open(path, "rb")  # noqa: SIM115 - closed below; only the opening may become an InputError
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+        raise read_failure(path, error) from error
     with stream:
         yield stream
 
@@ -298,13 +347,17 @@ def _array_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], np.dt
         else:
             raise InputError(f"{where}: .npy format version {version} is not supported; save a plain array")
     except _BROKEN_HEADER as error:
-        raise InputError(f"{where}: its header is not that of a .npy array ({error}); write it again") from error
+        raise InputError(
+            f"{where}: its header is not that of a .npy array ({type(error).__name__}); write it again"
+        ) from error
     if dtype.hasobject:
         raise InputError(
             f"{where}: holds Python objects, which are not loaded because reading them can run code; "
             "save it as a plain numeric array"
         )
-    return tuple(int(n) for n in shape), dtype
+    if not all(type(n) is int for n in shape):  # numpy takes True for a number here, and fails on it later
+        raise InputError(f"{where}: shape {shape} is not of whole numbers; write it again")
+    return shape, dtype
 
 
 def _check_size(shape: tuple[int, ...], dtype: np.dtype[Any], available: int, where: str) -> None:
@@ -318,11 +371,8 @@ def _check_size(shape: tuple[int, ...], dtype: np.dtype[Any], available: int, wh
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, ndim: int | None) -> npt.NDArray[Any]:
-    name = info.filename.removesuffix(".npy")
-    where = f"{path}: array {name!r}"
-    with archive.open(info) as stream:
-        shape, dtype = _array_header(stream, where)
-        _check_size(shape, dtype, info.file_size - stream.tell(), where)
+    where = f"{path}: array {info.filename.removesuffix('.npy')!r}"
+    shape, dtype = _member_header(archive, info, path)
     if ndim is not None and len(shape) != ndim:
         raise InputError(f"{where} has shape {shape}, but {ndim} dimensions are expected")
     if ndim is not None and dtype.kind not in "biuf":
@@ -330,3 +380,13 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, nd
     with archive.open(info) as stream:
         array: npt.NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
     return array
+
+
+def _member_header(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path
+) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    where = f"{path}: array {info.filename.removesuffix('.npy')!r}"
+    with archive.open(info) as stream:
+        shape, dtype = _array_header(stream, where)
+        _check_size(shape, dtype, info.file_size - stream.tell(), where)
+    return shape, dtype

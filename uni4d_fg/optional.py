@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import re
 from typing import Any
 
 from uni4d_fg.errors import MissingDependencyError
+
+_NO_MEMORY = ("cannot allocate memory", "failed to map segment", "cannot map", "out of memory")
+"""What the loader of libraries says then; a system library that is missing, it names."""
 
 _APT_COMMAND = "apt-get install libusb-1.0-0 libgl1 libgomp1"
 
@@ -24,7 +28,15 @@ def _import_extra(name: str, extra: str, needs_it: str) -> Any:
         command = f"pip install 'uni4d-fg[{extra}]'" if missing == name else f"pip install {missing}"
         raise MissingDependencyError(f"{needs_it} {missing}, not installed: run `{command}`") from error
     except (ImportError, OSError) as error:
+        _check_memory(name, error)
         raise MissingDependencyError(f"{name} cannot be loaded ({error}): install it anew") from error
+
+
+def _check_memory(name: str, error: ImportError | OSError) -> None:
+    """Raise MemoryError if a library is there, but there is no memory to load it into."""
+    text = str(error).lower()
+    if getattr(error, "errno", None) == errno.ENOMEM or any(sign in text for sign in _NO_MEMORY):
+        raise MemoryError(f"loading {name}: {error}") from error
 
 
 def import_torch() -> Any:
@@ -63,6 +75,7 @@ def import_open3d() -> Any:
             raise MissingDependencyError("open3d is not installed: run `pip install 'open3d>=0.19'`") from error
         raise MissingDependencyError(f"open3d needs the Python package {error.name!r}: install it") from error
     except (ImportError, OSError) as error:
+        _check_memory("open3d", error)
         library = re.search(r"lib[\w.+-]*\.so[.\d]*", str(error))
         missing = f"the system library {library.group()} is missing" if library else str(error)
         raise MissingDependencyError(f"open3d cannot be loaded, {missing}: run `{_APT_COMMAND}`") from error

@@ -4,6 +4,7 @@
 
 #include <limits>
 #include <memory>
+#include <mutex>
 #include <optional>
 #include <tuple>
 
@@ -90,6 +91,7 @@ class BoundLandmarkSystem {
     NewArray out({static_cast<std::size_t>(system_->num_batches())});
     {
       nb::gil_scoped_release release;
+      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
       system_->energies(state, out.data());
     }
     return nb::cast(out.release());
@@ -102,6 +104,7 @@ class BoundLandmarkSystem {
     LinearizeResult result;
     {
       nb::gil_scoped_release release;
+      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
       result = system_->linearize(state, out.view());
     }
     return nb::make_tuple(out.core.release(), out.border.release(), out.corner.release(), out.gradient.release(),
@@ -112,6 +115,7 @@ class BoundLandmarkSystem {
     expect_linearized();
     const auto count = static_cast<std::size_t>(system_->problem().num_landmarks);
     NewArray blocks({count, 3, 3}), gradients({count, 3});
+    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
     system_->landmark_blocks(blocks.data(), gradients.data());
     return nb::make_tuple(blocks.release(), gradients.release());
   }
@@ -122,6 +126,7 @@ class BoundLandmarkSystem {
     const double* block_data = expect_floats(blocks, "blocks", {landmarks.rows(), 3, 3}).data;
     const double* gradient_data = expect_floats(gradients, "gradients", {landmarks.rows(), 3}).data;
     nb::gil_scoped_release release;
+    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
     return system_->add_to_landmarks(landmarks.rows(), landmarks.data, block_data, gradient_data);
   }
 
@@ -132,6 +137,7 @@ class BoundLandmarkSystem {
     NewArray out({static_cast<std::size_t>(landmarks.rows()), 3, width});
     {
       nb::gil_scoped_release release;
+      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
       system_->whitened_coupling(landmarks.rows(), landmarks.data, out.data());
     }
     return nb::cast(out.release());
@@ -141,6 +147,7 @@ class BoundLandmarkSystem {
     if (!system_->reduced()) refuse("inverse_factors: call reduce first");
     const auto landmarks = expect_free_landmarks(rows);
     NewArray out({static_cast<std::size_t>(landmarks.rows()), 3, 3});
+    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
     system_->inverse_factors(landmarks.rows(), landmarks.data, out.data());
     return nb::cast(out.release());
   }
@@ -166,6 +173,7 @@ class BoundLandmarkSystem {
     bool positive = false;
     {
       nb::gil_scoped_release release;
+      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
       positive = system_->reduce({damping, min_diagonal, max_diagonal}, hessian, out.view());
     }
     if (!positive) return nb::none();
@@ -181,6 +189,7 @@ class BoundLandmarkSystem {
     StepSums sums;
     {
       nb::gil_scoped_release release;
+      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
       sums = system_->back_substitute(step.data, extra_data, out.data());
     }
     return nb::make_tuple(out.release(), sums.slope, sums.damped, sums.squared);
@@ -225,13 +234,17 @@ class BoundLandmarkSystem {
   }
 
   std::unique_ptr<LandmarkSystem> system_;
+  /// Calls share scratch memory. Taken where the interpreter's lock is released, or for a moment while it is held: who
+  /// holds this one never waits for that one.
+  mutable std::mutex mutex_;
 };
 
 }  // namespace
 
 void bind_landmark_system(nb::module_& module) {
   nb::class_<BoundLandmarkSystem>(module, "LandmarkSystem",
-                                  "The landmark Schur complement of bundle adjustment. Not to be shared by threads.")
+                                  "The landmark Schur complement of bundle adjustment. One call runs at a time; a "
+                                  "linearization and what follows from it belong to one thread.")
       .def(nb::init<const std::vector<BatchArguments>&, const std::vector<BatchArguments>&, std::int64_t,
                     const AnyArray&, const AnyArray&, bool, std::int64_t, bool, int>(),
            nb::arg("reprojection"), nb::arg("depth"), nb::arg("num_frames"), nb::arg("landmark_free"),

@@ -214,7 +214,7 @@ def test_overwrite_replaces_results_and_nothing_else(cli: Run, scene: Path, tmp_
     assert f"results: {tmp_path}" in out
     assert "bundle adjustment: " in err
     assert (tmp_path / "notes.txt").exists()
-    assert not (tmp_path / "clouds").exists()
+    assert [path.name for path in (tmp_path / "clouds").iterdir()] == ["stale.ply"]
 
 
 def test_an_unusable_sequence_does_not_cost_an_earlier_run(cli: Run, finished: Path, tmp_path: Path) -> None:

@@ -195,10 +195,10 @@ def test_what_is_neither_preset_nor_file_is_refused(name: str) -> None:
 
 
 def test_a_folder_and_a_binary_file_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="is a folder, but a YAML file is expected"):
         load_config(tmp_path)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="is not text in UTF-8"):
         load_config(tmp_path / "binary.yaml")
 
 

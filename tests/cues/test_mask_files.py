@@ -224,11 +224,11 @@ def _json(tmp_path: Path, content: Any) -> Path:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[{", "is not JSON"),
+        ("[{", "cannot be read as JSON"),
         ({"a": 1}, "no masks in a known form"),
         ([{"image_id": 0, "category_id": 1, "bbox": [0, 0, 1, 1]}], "has no mask, only a box"),
         ([{"category_id": 1}], "has no 'image_id'"),
-        ([{"image_id": 0, "category_id": "dog", "segmentation": {}}], "that is no number"),
+        ([{"image_id": 0, "category_id": "dog", "segmentation": {}}], "that is no whole number"),
         ([{"image_id": "x9", "category_id": 1, "score": 1, "segmentation": rle(box(0, 0))}], "names frames x9"),
         ([{"image_id": 0, "category_id": 1, "score": 1, "segmentation": rle(np.ones((3, 3), bool))}], "3 x 3 px"),
         ([{"image_id": 0, "category_id": 1, "score": 1, "segmentation": {"size": [6, 8]}}], "must be a list"),

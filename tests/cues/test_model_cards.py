@@ -68,7 +68,7 @@ def test_what_is_no_card_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"bad\.yaml"):
         load_card(tmp_path / "bad.yaml")
-    with pytest.raises(ConfigError, match="no such model card"):
+    with pytest.raises(ConfigError, match="no such file; a YAML file"):
         load_card(tmp_path / "absent.yaml")
 
 
@@ -103,7 +103,7 @@ def test_models_are_found_by_name_path_and_folder(tmp_path: Path, monkeypatch: p
         ("nosuch", "choose one of depth_anything_v2"),
         ("net.onnx", "needs a card"),
         ("sinet_person", "for segmentation"),
-        ("depth_pro=/no/such.onnx", "no such ONNX file"),
+        ("depth_pro=/no/such.onnx", "no such file; the ONNX file of depth_pro="),
     ],
 )
 def test_a_wrong_choice_is_one_error(choice: str, said: str) -> None:

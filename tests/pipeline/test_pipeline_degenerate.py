@@ -356,8 +356,8 @@ def broken_parts(scene: Sequence) -> dict[str, tuple[dict[str, object], str]]:
         "too few times": ({"timestamps": times[:4]}, "one strictly increasing number of seconds per frame"),
         "too few depth maps": ({"depths": ArrayFrames(depth_of(scene)[:5])}, "has 5 depth maps, but there are 8"),
         "too few masks": ({"masks": ArrayFrames(masks_of(scene)[:5])}, "has 5 masks, but there are 8 images"),
-        "small images": ({"images": ArrayFrames(grey)}, r"image of frame 0 is \(90, 128\)"),
-        "small depth": ({"depths": ArrayFrames(depth_of(scene)[:, :90])}, r"depth of frame 0 is \(90, 128\)"),
+        "small images": ({"images": ArrayFrames(grey)}, r"image of frame 0 has shape \(90, 128, 3\)"),
+        "small depth": ({"depths": ArrayFrames(depth_of(scene)[:, :90])}, r"depth of frame 0 has shape \(90, 128\)"),
     }  # fmt: skip
 
 

@@ -180,7 +180,12 @@ def test_files_of_others_are_left_alone(finished: Path, sequence: Sequence) -> N
     for folder in folders:
         folder.mkdir(parents=True)
     ours = [finished / ".tmp-0123abcd-labels.npz", finished / "stages" / ".tmp-89abcdef-nonrigid.npz"]
-    ours += [finished / "clouds" / "dynamic" / ".tmp-89abcdef-00001.ply", finished / "pictures" / ".tmp-0a0a0a0a-a.png"]
+    ours += [finished / "clouds" / "dynamic" / ".tmp-89abcdef-00001.ply"]
+    ours += [
+        finished / "pictures" / ".tmp-0a0a0a0a-scene.png",
+        finished / "stages/windows/.tmp-0a0a0a0a-scene_000000.npz",
+    ]
+    ours += [finished / "cues" / "depth" / "card-0123" / ".tmp-0a0a0a0a-0123.npy"]
     for path in ours:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("left by a killed run")

@@ -16,6 +16,7 @@ from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import SequenceInput
 from uni4d_fg.errors import Cancelled, ConfigError, OutputError
+from uni4d_fg.reading import resolved
 
 COMPARISON_FILE = "comparison.json"
 _QUIET_OUTPUT = ("output.clouds=false", "output.pictures=false")
@@ -72,15 +73,15 @@ def compare(
         )
         for s in sequences
     ]
-    names = [path.resolve().name for path in sequences]
+    names = [resolved(path).name for path in sequences]
     if len(set(names)) < len(names):
         raise ConfigError(f"two sequences have the same folder name ({', '.join(names)}); compare them one by one")
-    _prepare_folder(out, resume)
+    opened = [source.read() for source in sources]  # whether all are there is known before the first takes minutes
     done: list[Comparison] = []
+    _prepare_folder(out, resume)
     command = shlex.join(["uni4d-fg", *sys.argv[1:]])
     with Interruption() as stop, progress_reporter(quiet) as reporter:
-        for name, source in zip(names, sources, strict=True):
-            sequence = source.read()
+        for name, sequence in zip(names, opened, strict=True):
             for preset, config in configs.items():
                 folder = out / name / preset
                 try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from typing import Any
 
@@ -29,8 +30,10 @@ def one_line(error: BaseException) -> str:
 
 
 def print_error(message: str, kind: str = "error") -> None:
-    """Print one line on standard error."""
-    typer.echo(f"{kind}: {message}", err=True)
+    """Print one line on standard error, if there is one; what cannot be encoded is written as escapes."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        text = f"{kind}: {message}"
+        typer.echo(text.encode("utf-8", "backslashreplace").decode("utf-8"), err=True)
 
 
 def print_json(value: Any) -> None:

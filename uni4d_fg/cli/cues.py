@@ -16,6 +16,7 @@ from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.reconstruction import class_list
 from uni4d_fg.cli.runs import SequenceInput
 from uni4d_fg.errors import Cancelled, OutputError
+from uni4d_fg.results.run_contents import is_free, is_run, mark_run, remove_leftovers, run_lock
 
 
 class WrittenLayout(str, Enum):
@@ -74,7 +75,11 @@ def cues(
     plan = replace(source.plan(opened), keep_built_in_tracks=True)
     plan.check()
     work = out.with_name(f"{out.name}-unfinished")
-    with Interruption() as stopped, progress_reporter(quiet) as reporter:
+    if not (is_free(work) or is_run(work)):
+        raise OutputError(f"{work}: is needed for what is unfinished, but holds something else; choose another --out")
+    with run_lock(work), Interruption() as stopped, progress_reporter(quiet) as reporter:
+        mark_run(work)
+        remove_leftovers(work)
         try:
             sequence, report = gather_cues(opened.video, plan, work, settings, reporter=reporter, should_stop=stopped)
         except Cancelled as error:

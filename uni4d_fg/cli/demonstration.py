@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from uni4d_fg.cli.progress import progress_reporter
-from uni4d_fg.cli.runs import DEMO_SEQUENCE, SequenceInput, is_run, remove_results
+from uni4d_fg.cli.runs import DEMO_SEQUENCE, SequenceInput
 from uni4d_fg.cli.scenes import SCENE_FILE, reuse_or_write_scene
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.errors import OutputError
@@ -14,6 +16,7 @@ from uni4d_fg.pipeline import RunSummary
 from uni4d_fg.results.evaluate.points import PointMetrics
 from uni4d_fg.results.evaluate.run import EvaluationReport
 from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.run_contents import is_free, is_run, remove_results, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import Reconstruction
 
@@ -21,21 +24,33 @@ DEMO_SCENE = SyntheticSceneConfig(num_frames=24, width=320, height=240)
 FAST_SCENE = SyntheticSceneConfig(num_frames=12, width=200, height=150, focal=188.0, grid_columns=24, grid_rows=18)
 
 
-def prepare_demo_folder(folder: Path, *, resume: bool) -> None:
-    """Make sure that the demo may be written to ``folder``; results of an earlier demo are removed.
+@contextmanager
+def demo_folder(folder: Path, *, resume: bool) -> Iterator[None]:
+    """Make sure that the demo, and it alone, may be written to ``folder``; results of an earlier demo are removed.
+
+    Raises:
+        OutputError: If the folder holds anything but an earlier demo, or another process writes there.
+    """
+    prepare_demo_folder(folder)
+    with run_lock(folder):
+        if not resume:
+            remove_results(folder)
+        yield
+
+
+def prepare_demo_folder(folder: Path) -> None:
+    """Make sure that the demo may be written to ``folder``.
 
     Raises:
         OutputError: If the folder holds anything but an earlier demo.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; choose another --out")
-    if not folder.exists() or not any(folder.iterdir()):
+    if is_free(folder):
         return
     if not (folder / DEMO_SEQUENCE / SCENE_FILE).is_file():
         what = "a run that is not the demo" if is_run(folder) else "something else"
         raise OutputError(f"{folder}: holds {what}; choose another --out")
-    if not resume:
-        remove_results(folder)
 
 
 def demo_input(folder: Path, *, fast: bool, quiet: bool) -> SequenceInput:

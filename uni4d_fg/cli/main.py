@@ -22,7 +22,8 @@ from uni4d_fg.cli import (
     viewing,
 )
 from uni4d_fg.cli.console import log_to_stderr, one_line, print_error
-from uni4d_fg.errors import Cancelled, Uni4dFgError
+from uni4d_fg.cli.failures import finish, known_error
+from uni4d_fg.errors import Cancelled
 
 UNEXPECTED_EXIT_CODE = 70
 
@@ -70,12 +71,13 @@ def run(arguments: list[str]) -> int:
         app(args=[word for word in arguments if word != "--debug"], prog_name="uni4d-fg")
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1 if stop.code else 0
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()
-        if isinstance(error, Uni4dFgError):
-            print_error(one_line(error), "stopped" if isinstance(error, Cancelled) else "error")
-            return error.exit_code
+        known = known_error(error)
+        if known is not None:
+            print_error(one_line(known), "stopped" if isinstance(known, Cancelled) else "error")
+            return known.exit_code
         print_error(
             f"unexpected {type(error).__name__}: {one_line(error)}; please report this with the command line "
             "and the output of the same command with --debug"
@@ -86,7 +88,7 @@ def run(arguments: list[str]) -> int:
 
 def main() -> None:
     """Run the command line of this process."""
-    sys.exit(run(sys.argv[1:]))
+    sys.exit(finish(run(sys.argv[1:])))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import CUE_FOLDER, SequenceInput, prepare_run_folder
 from uni4d_fg.errors import Cancelled, ConfigError
+from uni4d_fg.results.run_contents import mark_run, run_lock
 
 if TYPE_CHECKING:
     from uni4d_fg.config.models import Config
@@ -77,7 +78,7 @@ def reconstruct(
         intrinsics=intrinsics, start=start, stop=stop, stride=stride, max_size=max_size, depth_model=depth_model,
         mask_model=mask_model, classes=class_list(classes), track_model=track_model,
     )  # fmt: skip
-    run = out or Path("runs") / (seq.stem if seq.is_file() else seq.resolve().name)
+    run = out or Path("runs") / (seq.stem if seq.is_file() else Path(source.root).name)
     samples = None if imu is None else read_imu(imu)
     opened = source.open()
     if samples is not None:
@@ -85,15 +86,15 @@ def reconstruct(
         samples.check_covers(opened.video.timestamps)
     plan = source.plan(opened)
     plan.check()
-    prepare_run_folder(run, resume=resume, overwrite=overwrite)
-    source.save(run)
-    sequence, report = run_cues(opened.video, plan, run, settings, quiet=quiet)
-    if report is not None and report.settings is not None:
-        settings = report.settings
-    files = MeasurementFiles(odometry, gps, relative_poses)
-    summary = run_pipeline(
-        sequence, run, settings, resume=resume, quiet=quiet, cues=report, measurements=files, imu=samples
-    )
+    with run_lock(run):
+        prepare_run_folder(run, source, resume=resume, overwrite=overwrite)
+        sequence, report = run_cues(opened.video, plan, run, settings, quiet=quiet)
+        if report is not None and report.settings is not None:
+            settings = report.settings
+        files = MeasurementFiles(odometry, gps, relative_poses)
+        summary = run_pipeline(
+            sequence, run, settings, resume=resume, quiet=quiet, cues=report, measurements=files, imu=samples
+        )
     if json:
         print_json(summary.to_dict())
     else:
@@ -115,12 +116,13 @@ def demo(
     from uni4d_fg.results.evaluate.run import evaluate_run
 
     settings = load_config(config or ("fast" if fast else None), changes or ())
-    demonstration.prepare_demo_folder(out, resume=resume)
-    source = demonstration.demo_input(out, fast=fast, quiet=quiet)
-    source.save(out)
-    sequence = source.read()
-    summary = run_pipeline(sequence, out, settings, resume=resume, quiet=quiet)
-    report = evaluate_run(out, sequence)
+    with demonstration.demo_folder(out, resume=resume):
+        source = demonstration.demo_input(out, fast=fast, quiet=quiet)
+        mark_run(out)
+        source.save(out)
+        sequence = source.read()
+        summary = run_pipeline(sequence, out, settings, resume=resume, quiet=quiet)
+        report = evaluate_run(out, sequence)
     if json:
         print_json({"summary": summary.to_dict(), "evaluation": report.to_dict()})
     else:

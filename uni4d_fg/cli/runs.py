@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
+
 from uni4d_fg.cli.options import LayoutChoice
-from uni4d_fg.cues.manifest import MANIFEST, has_manifest, load_cues
+from uni4d_fg.cues.manifest import has_manifest, load_cues
 from uni4d_fg.cues.plan import CueFiles, CuePlan, plan_cues
 from uni4d_fg.errors import ConfigError, InputError, OutputError
-from uni4d_fg.files import atomic_write_json, write_failure
+from uni4d_fg.files import atomic_write_json
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.layout import Layout, LayoutOptions
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.sequence.read import detect_layout, read_sequence
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
+from uni4d_fg.reading import expanded, is_present, read_text, resolved
+from uni4d_fg.results.run_contents import is_free, is_run, mark_run, remove_leftovers, remove_results
 from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.results.summary_file import read_summary
 
 STORED_INPUT = "input.json"
 DEMO_SEQUENCE = "sequence"
 CUE_FOLDER = "cues"
 
 _MADE_MASKS = ("motion", "none")
+_SAME_VIDEO = ("root", "layout", "start", "stop", "stride", "max_size")
+_MAX_INPUT_BYTES = 1024**2
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,7 @@ class OpenedInput:
     """It is frames only: a video file, or images without a depth cue of their own."""
 
 
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True)
 class SequenceInput:
     """What was asked for on the command line; kept beside a run's results."""
@@ -77,7 +83,7 @@ class SequenceInput:
             known_intrinsics: Take ``K.npy`` instead of the estimate (Uni4D's layout).
             more: The other fields.
         """
-        root = root.resolve()
+        root = resolved(root)
         more["intrinsics"] = _absolute(root, more.get("intrinsics"))
         return cls(
             str(root), layout.value, _absolute(root, depth), _absolute(root, masks), _absolute(root, tracks),
@@ -141,6 +147,19 @@ class SequenceInput:
         video = self.open().video
         return as_sequence(replace(video, masks=None) if self.masks == "none" else video)
 
+    @classmethod
+    def load(cls, path: Path) -> SequenceInput:
+        """Read what :meth:`save` wrote. Raises InputError."""
+        text = read_text(path, _MAX_INPUT_BYTES, "a .json file")
+        try:
+            return TypeAdapter(cls).validate_json(text, strict=True)
+        except (ValidationError, RecursionError) as error:
+            detail = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
+            what = " ".join(str(part) for part in (*detail["loc"], detail["msg"]))
+            raise InputError(
+                f"{path}: does not say what the run was made from ({what}); give the sequence with --sequence"
+            ) from error
+
     def save(self, run: Path) -> None:
         """Write it into a run's folder. Raises OutputError."""
         stored = asdict(self)
@@ -181,81 +200,87 @@ def _absolute(root: Path, value: str | None) -> str | None:
     """Return a cue's name as it is, and the path of a file elsewhere as an absolute one."""
     if value is None or value in _MADE_MASKS or _is_named_in(root, value):
         return value
-    path = Path(value).expanduser()
-    return str(path.resolve()) if path.exists() else value
+    path = expanded(value)
+    return str(resolved(path)) if is_present(path) else value
 
 
 def _is_named_in(root: Path, value: str) -> bool:
     """Tell whether ``value`` can only be a name within the folder ``root``: it is there, or nowhere else either."""
     if not root.is_dir() or Path(value).is_absolute():
         return False
-    return (root / value).exists() or (root / f"{value}.npy").exists() or not Path(value).expanduser().exists()
+    return is_present(root / value) or is_present(root / f"{value}.npy") or not is_present(expanded(value))
+
+
+def _is_there(name: str) -> bool:
+    """Tell whether a path that was written down leads anywhere; one that cannot exist does not."""
+    try:
+        return is_present(Path(name))
+    except InputError:
+        return False
 
 
 def _beside(root: Path, value: str) -> Path:
     """Return the file of that name in the sequence folder, if there is one, else the path as it is."""
     inside = root / value
-    return inside if root.is_dir() and inside.exists() else Path(value)
+    return inside if root.is_dir() and is_present(inside) else Path(value)
 
 
-def is_run(folder: Path) -> bool:
-    """Tell whether a folder holds a run, finished or not."""
-    run = RunFolder(folder)
-    if run.config.is_file() and (run.summary.is_file() or (folder / "stages").is_dir()):
-        return True
-    try:
-        stored = _read_json(folder / STORED_INPUT)
-    except InputError:
-        return False
-    return {"root", "layout"} <= set(stored) <= {field.name for field in fields(SequenceInput)}
+def prepare_run_folder(
+    folder: Path, source: SequenceInput, *, resume: bool, overwrite: bool, whole: bool = False
+) -> None:
+    """Make sure that a run may be written to ``folder``, and write down what it is made from.
 
-
-def prepare_run_folder(folder: Path, *, resume: bool, overwrite: bool) -> None:
-    """Make sure that a run may be written to ``folder``; ``overwrite`` removes an earlier run's results.
+    Args:
+        folder: Of the run.
+        source: What it will be made from; what is there is continued only if it was made from the same video.
+        resume: Continue an earlier run.
+        overwrite: Remove an earlier run's results.
+        whole: Of the earlier run everything must have been the same, its cues too: nothing is made anew.
 
     Raises:
         OutputError: If the folder holds anything but a run, or a run that is neither to be continued nor
-            replaced.
+            replaced, or one of another video.
     """
     if resume and overwrite:
         raise OutputError("--resume and --overwrite exclude each other; give one of them")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; choose another --out")
-    if not folder.exists() or not any(folder.iterdir()):
-        return
-    if not is_run(folder):
+    try:
+        free = is_free(folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be read ({error.strerror}); choose another --out") from error
+    if free:
+        remove_leftovers(folder)
+    elif not is_run(folder):
         raise OutputError(f"{folder}: is not empty and holds no run; choose another --out")
-    if overwrite:
+    elif overwrite:
         remove_results(folder)
     elif not resume:
         raise OutputError(f"{folder}: holds a run already; continue it with --resume or replace it with --overwrite")
+    else:
+        _check_same_video(folder, source, whole)
+    mark_run(folder)
+    source.save(folder)
 
 
-def remove_results(folder: Path) -> None:
-    """Remove what runs write, and nothing else; maps of networks stay, as they go by content and take long to make.
-
-    Raises:
-        OutputError: If something cannot be removed.
-    """
-    run = RunFolder(folder)
-    files = (
-        run.reconstruction, run.trajectory, run.depth, run.summary, run.config, run.labels, folder / STORED_INPUT,
-        folder / CUE_FOLDER / MANIFEST, run.report,
-    )  # fmt: skip
+def _check_same_video(folder: Path, source: SequenceInput, whole: bool) -> None:
+    """Raise OutputError if the run in a folder was made from another video, or another part of it."""
+    path = folder / STORED_INPUT
+    if not path.is_file():
+        return
     try:
-        for path in files:
-            path.unlink(missing_ok=True)
-        for path in (
-            run.static_cloud.parent,
-            run.trajectory_picture.parent,
-            folder / "stages",
-            run.graphs,
-            run.exports,
-        ):
-            if path.is_dir():
-                shutil.rmtree(path)
-    except OSError as error:
-        raise write_failure(Path(error.filename or folder), error) from error
+        stored = SequenceInput.load(path)
+    except InputError as error:
+        raise OutputError(f"{error}; what the run was made from is not known: replace it with --overwrite") from error
+    names = [f.name for f in fields(SequenceInput) if f.compare and (whole or f.name in _SAME_VIDEO)]
+    moved = not _is_there(stored.root) and Path(stored.root).name == Path(source.root).name
+    changed = [n for n in names if getattr(stored, n) != getattr(source, n) and not (n == "root" and moved)]
+    if changed:
+        was = ", ".join(f"{name} {getattr(stored, name)}" for name in changed)
+        raise OutputError(
+            f"{folder}: holds a run of {was}; continue it with the same, replace it with --overwrite, or choose "
+            "another --out"
+        )
 
 
 def stored_input(folder: Path) -> SequenceInput:
@@ -267,30 +292,16 @@ def stored_input(folder: Path) -> SequenceInput:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a run")
     path, summary = folder / STORED_INPUT, RunFolder(folder).summary
-    if path.exists():
-        stored = _read_json(path)
-    elif summary.exists():
-        sequence = _read_json(summary).get("sequence")
-        stored = {"root": sequence.get("root")} if isinstance(sequence, dict) else {}
+    if is_present(path):
+        result = SequenceInput.load(path)
+    elif is_present(summary):
+        sequence = read_summary(summary).get("sequence", {})
+        result = SequenceInput(sequence.get("root") or "")
     else:
         raise InputError(f"{folder}: is not the folder of a finished run; it has no {summary.name}")
-    if isinstance(stored.get("classes"), list):
-        stored["classes"] = tuple(stored["classes"])
-    try:
-        result = SequenceInput(**stored)
-    except TypeError:
-        result = SequenceInput("")
-    if not result.root or not isinstance(result.root, str):
+    if not result.root:
         raise InputError(f"{folder}: does not say which sequence it was made from; give it with --sequence")
     own = folder / DEMO_SEQUENCE
-    if not Path(result.root).exists() and own.is_dir():
+    if not _is_there(result.root) and own.is_dir():
         return SequenceInput(str(own))
     return replace(result, cues=str(folder / CUE_FOLDER))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error}); give the sequence with --sequence") from error
-    return value if isinstance(value, dict) else {}

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from uni4d_fg.config.load import dump_config, with_overrides
+from uni4d_fg.config.load import dump_config, read_yaml, with_overrides
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
-from uni4d_fg.errors import InputError, OutputError
+from uni4d_fg.errors import ConfigError, InputError, OutputError
 from uni4d_fg.files import atomic_write_text
 from uni4d_fg.frontend.measurements.imu import write_imu
 from uni4d_fg.frontend.sequence.model import Sequence as VideoSequence
@@ -59,6 +58,25 @@ def write_scene(
     return sequence
 
 
+_SCENE_FILES = re.compile(
+    r"scene\.yaml|K\.npy|c2w\.npy|timestamps\.txt|world_T_cam_init\.npy|tracks\.npz|ground_truth\.npz"
+    r"|(depth_cue|depth_gt)\.npy|(rgb|masks|depth_cue|depth_gt)/\d+\.png"
+)
+
+
+def _remove_scene(folder: Path) -> None:
+    """Remove the files of a synthetic scene in the native layout.
+
+    Raises:
+        OutputError: If there is anything else in the folder, or a file cannot be removed.
+    """
+    files = [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]
+    foreign = [path for path in files if not _SCENE_FILES.fullmatch(path.relative_to(folder).as_posix())]
+    if foreign:
+        raise OutputError(f"{foreign[0]}: is not of the scene that is to be replaced; move it or choose another folder")
+    shutil.rmtree(folder)
+
+
 def reuse_or_write_scene(scene: SyntheticSceneConfig, folder: Path) -> bool:
     """Make sure that ``folder`` holds this scene in the native layout; another synthetic scene is replaced.
 
@@ -70,11 +88,11 @@ def reuse_or_write_scene(scene: SyntheticSceneConfig, folder: Path) -> bool:
     """
     if (folder / SCENE_FILE).is_file():
         try:
-            known = yaml.safe_load((folder / SCENE_FILE).read_text(encoding="utf-8"))
-        except (yaml.YAMLError, OSError, ValueError):
+            known = read_yaml(folder / SCENE_FILE)
+        except ConfigError:
             known = None
         if known == scene.model_dump(mode="json"):
             return True
-        shutil.rmtree(folder)
+        _remove_scene(folder)
     write_scene(scene, folder)
     return False

@@ -16,6 +16,8 @@ from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
+from uni4d_fg.reading import resolved
+from uni4d_fg.results.run_contents import run_lock
 
 if TYPE_CHECKING:
     from uni4d_fg.progress import Reporter
@@ -61,7 +63,7 @@ def stream(
         root, layout, depth, masks, tracks, depth_gt_scale=1000.0, known_intrinsics=known_intrinsics,
         intrinsics=intrinsics, start=start, stop=stop, stride=stride, max_size=max_size,
     )  # fmt: skip
-    run = out or Path("runs") / f"{root.stem if root.is_file() else root.resolve().name}-stream"
+    run = out or Path("runs") / f"{root.stem if root.is_file() else resolved(root).name}-stream"
     if source.open().video.depths is None:
         raise InputError(
             f"{root}: has no depth, which 'stream' needs of every frame: give --depth FOLDER or FILE.npy, or make it "
@@ -70,9 +72,8 @@ def stream(
     sequence = source.read()
     if online_tracks:
         sequence = replace(sequence, tracks=None)
-    prepare_run_folder(run, resume=resume, overwrite=overwrite)
-    source.save(run)
-    with Interruption() as interrupted, progress_reporter(quiet) as reporter:
+    with run_lock(run), Interruption() as interrupted, progress_reporter(quiet) as reporter:
+        prepare_run_folder(run, source, resume=resume, overwrite=overwrite, whole=True)
         reporter.begin("stream", sequence.num_frames)
         try:
             summary = stream_sequence(

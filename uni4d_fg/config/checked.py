@@ -35,17 +35,21 @@ def build_section(
         ConfigError: With every problem found (at most five): source, dotted path, value given, values allowed.
     """
     problems = list(_not_plain(values, ()))
-    plain = not problems
+    plain, count = not problems, len(problems)
     if plain:
         try:
             # JSON is strict about types but lets a list become a tuple.
             return model.model_validate_json(json.dumps(values), strict=True)
         except ValidationError as error:
-            problems = [_problem(model, detail) for detail in error.errors(include_url=False)]
+            found = error.errors(include_url=False)
+            # Only what is said is worked out: the names nearest to thousands of unknown ones take minutes.
+            problems, count = [_problem(model, detail) for detail in found[:_MAX_LISTED]], len(found)
+        except (ValueError, RecursionError) as error:
+            problems, count = [((), f"a value cannot be used ({error})")], 1
     # Fields that contradict each other may come from several sources.
     texts = [text if plain and not path else f"{source_of(path)}: {text}" for path, text in problems[:_MAX_LISTED]]
-    if len(problems) > _MAX_LISTED:
-        texts.append(f"and {len(problems) - _MAX_LISTED} more")
+    if count > _MAX_LISTED:
+        texts.append(f"and {count - _MAX_LISTED} more")
     raise ConfigError("; ".join(texts))
 
 
@@ -102,5 +106,5 @@ def _problem(model: type[Section], detail: Any) -> tuple[tuple[str, ...], str]:
 
 
 def _shown(value: Any) -> str:
-    text = json.dumps(value, default=str)
+    text = json.dumps(value, default=str, skipkeys=True)
     return text if len(text) <= 60 else f"{text[:57]}..."

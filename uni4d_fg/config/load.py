@@ -7,7 +7,6 @@ A configuration is built in layers, each holding only what it changes: the defau
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -19,33 +18,15 @@ from uni4d_fg.config.base import Section
 from uni4d_fg.config.checked import build_section, unknown_field
 from uni4d_fg.config.describe import find_field
 from uni4d_fg.config.models import Config
-from uni4d_fg.errors import ConfigError
+from uni4d_fg.config.yaml_text import MAX_YAML_BYTES, parse_yaml
+from uni4d_fg.errors import ConfigError, InputError
+from uni4d_fg.reading import is_present, read_text
 
 SectionT = TypeVar("SectionT", bound=Section)
 
 DEFAULT_PRESET = "default"
 _PACKAGE = Path(__file__).resolve().parents[1]
 _SUFFIXES = (".yaml", ".yml")
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """The safe loader, which also reads 1e-3 as a number and refuses a key that is given twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            if isinstance(key_node, yaml.ScalarNode):
-                if key_node.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        None, None, f"{key_node.value!r} is given twice", key_node.start_mark
-                    )
-                seen.add(key_node.value)
-        return super().construct_mapping(node, deep)
-
-
-_PlainLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9]+(?:\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
 
 
 def presets_folder() -> Path:
@@ -132,9 +113,10 @@ def _parse_override(model: type[Section], text: str) -> tuple[tuple[str, ...], A
     if find_field(model, path) is None:
         raise ConfigError(f"--set: {unknown_field(model, path)}")
     try:
-        return path, yaml.load(value, _PlainLoader)
-    except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(f"--set {dotted}: {value!r} is not a YAML value ({_yaml_reason(error)})") from error
+        return path, parse_yaml(value)
+    except ConfigError as error:
+        shown = repr(value) if len(value) <= 60 else f"{value[:57]!r}..."
+        raise ConfigError(f"--set {dotted}: {shown} is not a YAML value ({error})") from error
 
 
 def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> None:
@@ -161,7 +143,14 @@ def _is_file_name(preset_or_file: str | Path) -> bool:
     if preset_or_file in preset_names():
         return False
     path = Path(preset_or_file)
-    return path.suffix.lower() in _SUFFIXES or len(path.parts) > 1 or path.exists()
+    return path.suffix.lower() in _SUFFIXES or len(path.parts) > 1 or _is_there(path)
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return is_present(path)
+    except InputError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _preset_of(path: Path, values: Mapping[str, Any]) -> str | None:
@@ -182,25 +171,26 @@ def _preset_path(name: str) -> Path:
     return path
 
 
+def read_yaml(path: Path) -> Any:
+    """Return the values in a YAML file.
+
+    Raises:
+        ConfigError: If it cannot be read, or is no YAML as configurations need it.
+    """
+    try:
+        text = read_text(path, MAX_YAML_BYTES, "a YAML file")
+    except InputError as error:
+        raise ConfigError(str(error)) from error
+    try:
+        return parse_yaml(text)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from error
+
+
 def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; a YAML file or the name of a preset is expected") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); a YAML file in UTF-8 is expected") from error
-    try:
-        values = yaml.load(text, _PlainLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {_yaml_reason(error)}") from error
+    values = read_yaml(path)
     if values is None:
         return {}
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds {type(values).__name__}, but a mapping of sections is expected")
     return values
-
-
-def _yaml_reason(error: Exception) -> str:
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-        return f"line {error.problem_mark.line + 1}: {error.problem}"
-    return " ".join(str(error).split())

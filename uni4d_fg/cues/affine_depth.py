@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.linalg import LinAlgError, solveh_banded
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.geometric_depth import AffineDepthConfig
@@ -42,6 +42,11 @@ from uni4d_fg.slam.stages.noise import robust_sigma
 
 _CONVERGED = 1e-5
 """A change below this part of the solution ends the reweighted solves."""
+_FLAT = 1e-9
+_FLAT_MAPS = (
+    "relative depth: the network's maps are the same everywhere, so that they say nothing of depth. Check the output "
+    "and the input scaling in its model card, and that the images are not empty"
+)
 _RIDGE = 1e-12
 """Relative addition to the diagonal, against rounding."""
 
@@ -127,7 +132,13 @@ def align_affine(
         use = enough & ~refused
         if not use.any():
             raise DegenerateProblemError(_why(enough, config))
-        fit = _fit(samples.select(use[samples.frame]), count, config, free_shift)
+        chosen = samples.select(use[samples.frame])
+        if free_shift and np.ptp(chosen.value) <= _FLAT * float(np.abs(chosen.value).max()):
+            raise DegenerateProblemError(_FLAT_MAPS)
+        try:
+            fit = _fit(chosen, count, config, free_shift)
+        except LinAlgError as error:
+            raise DegenerateProblemError(_FLAT_MAPS) from error
         wrong = use & (fit.scale <= 0)
         if not wrong.any():
             break

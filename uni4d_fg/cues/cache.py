@@ -20,7 +20,7 @@ import numpy.typing as npt
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.errors import InputError, OutputError
-from uni4d_fg.files import atomic_path, atomic_write_text, load_npy, load_npz, save_npy, save_npz
+from uni4d_fg.files import atomic_path, atomic_write_text, load_checksums, load_npy, load_npz, save_npy, save_npz
 from uni4d_fg.frontend.sequence.frames import FileFrames
 
 CACHE_VERSION = 1
@@ -65,19 +65,20 @@ class FrameCache:
         return self.folder / f"{key}.npy"
 
     def has_map(self, key: str, size: tuple[int, int]) -> bool:
-        """Tell whether a readable map of (height, width) is there."""
+        """Tell whether an undamaged map of (height, width) is there: it is read, and its checksum compared."""
         path = self.map_path(key)
         if not path.is_file():
             return False
         try:
-            return load_npy(path, memory_map=True).shape == size
+            values = load_npy(path)
+            return values.shape == size and values.dtype == np.float32 and load_checksums(path) is not None
         except InputError:
             return False
 
     def put_map(self, key: str, values: Float32Array) -> Path:
         """Write a map. Raises OutputError."""
         path = self.map_path(key)
-        save_npy(path, values.astype(np.float32, copy=False))
+        save_npy(path, values.astype(np.float32, copy=False), checksum=True)
         return path
 
     def camera(self, key: str) -> FloatArray | None:
@@ -90,7 +91,7 @@ class FrameCache:
 
     def put_camera(self, key: str, intrinsics: FloatArray) -> None:
         """Keep (4,) intrinsics with a map; to be called before :meth:`put_map`. Raises OutputError."""
-        save_npy(self.folder / f"{key}.camera.npy", intrinsics)
+        save_npy(self.folder / f"{key}.camera.npy", intrinsics, checksum=True)
 
     def detections(self, key: str, size: tuple[int, int]) -> FrameDetections | None:
         """Return the detections of a frame of (height, width) if they are there and readable."""

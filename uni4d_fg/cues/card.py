@@ -11,13 +11,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from pydantic import Field, model_validator
 
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.checked import build_section
-from uni4d_fg.config.load import presets_folder
-from uni4d_fg.errors import ConfigError, InputError
+from uni4d_fg.config.load import presets_folder, read_yaml
+from uni4d_fg.errors import ConfigError
+from uni4d_fg.reading import check_regular, expanded, resolved
 
 MODELS_VARIABLE = "UNI4D_FG_MODELS"
 """Environment variable that names a folder of ONNX files, which is looked into first."""
@@ -250,14 +250,7 @@ def load_card(path: Path) -> Card:
     Raises:
         ConfigError: If the file is missing, not YAML, or a field is unknown, missing or of a wrong value.
     """
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such model card") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); a model card is a YAML file in UTF-8") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    values = read_yaml(path)
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds {type(values).__name__}, but a model card is a mapping of fields")
     model = _MODELS.get(str(values.get("kind")))
@@ -280,7 +273,7 @@ def find_model(choice: str, kind: CardKind) -> ModelFile:
         InputError: If ``FILE`` is given and does not exist.
     """
     named, _, file = choice.partition("=")
-    path = Path(named).expanduser()
+    path = expanded(named)
     if path.suffix.lower() == ".onnx":
         raise ConfigError(
             f"{choice}: an ONNX file needs a card that says what it takes and gives: CARD={choice}, where CARD is one "
@@ -296,21 +289,20 @@ def find_model(choice: str, kind: CardKind) -> ModelFile:
     if card.kind != kind:
         raise ConfigError(f"{named}: this card is for {card.kind}, but one for {kind} is needed")
     if file:
-        weights = Path(file).expanduser()
-        if not weights.is_file():
-            raise InputError(f"{weights}: no such ONNX file; check the path given with {named}=")
-        return ModelFile(path.stem, card, path, weights.resolve())
+        weights = expanded(file)
+        check_regular(weights, f"the ONNX file of {named}=")
+        return ModelFile(path.stem, card, path, resolved(weights))
     places = _places(card, path)
     weights = next((place for place in places if place.is_file()), places[0])
     return ModelFile(path.stem, card, path, weights)
 
 
 def _places(card: Card, path: Path) -> tuple[Path, ...]:
-    file = Path(card.file).expanduser()
+    file = expanded(card.file)
     if file.is_absolute():
         return (file,)
     folder = os.environ.get(MODELS_VARIABLE)
-    return (*((Path(folder).expanduser() / file,) if folder else ()), (path.parent / file).resolve())
+    return (*((expanded(folder) / file,) if folder else ()), resolved(path.parent / file))
 
 
 def _names_of(kind: str) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,27 +15,17 @@ from uni4d_fg.cues.coco_classes import COCO_CLASSES
 from uni4d_fg.cues.detections import MOVABLE_CLASSES, FrameDetections, movable_class_ids
 from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.label_store import CompressedLabels
-from uni4d_fg.cues.rle import decode_rle
+from uni4d_fg.cues.rle import decode_rle, rle_size
 from uni4d_fg.frontend.sequence.frames import ConstantFrames, LazyFrames
 from uni4d_fg.frontend.sequence.layout import frame_numbers
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
 
+_MAX_CLASS, _MAX_TRACK = 2**31, 2**62
+_MAX_MASKS = 1000
+"""Masks of one frame above which they are refused: joining them over time takes minutes a frame."""
+
 _REWRITE = "write it as COCO results: a list of {image_id, category_id, score, segmentation: {size, counts}}"
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        InputError: If it cannot be read or is not JSON.
-    """
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise SequenceProblem(path, f"cannot be read ({error.strerror})", "check the file") from error
-    except (ValueError, RecursionError) as error:
-        raise SequenceProblem(path, f"is not JSON, or cut short ({error})", "write it again") from error
 
 
 @dataclass(frozen=True)
@@ -80,18 +69,17 @@ def parse(path: Path, content: Any) -> CocoContent:
 def _results(path: Path, entries: list[Any]) -> CocoContent:
     masks: dict[str, list[_Mask]] = {}
     for n, entry in enumerate(entries):
-        frame = _entry(path, entry, "image_id", n)
+        frame = _name(path, entry, "image_id", n)
         masks.setdefault(str(frame), []).append(_mask(path, entry, entry.get("segmentation"), n))
     scored = any(isinstance(entry, dict) and "score" in entry for entry in entries)
     return CocoContent(masks, has_scores=scored)
 
 
 def _data_set(path: Path, content: dict[str, Any]) -> CocoContent:
-    images = content.get("images", [])
-    stems = {str(_entry(path, i, "id", n)): Path(str(i.get("file_name", ""))).stem for n, i in enumerate(images)}
+    images, categories = _listed(path, content, "images"), _listed(path, content, "categories")
+    stems = {_name(path, i, "id", n): Path(str(i.get("file_name") or "")).stem for n, i in enumerate(images)}
     found = _results(path, content["annotations"])
-    categories = content.get("categories") or []
-    names = {int(_entry(path, c, "id", n)): str(c.get("name", "")) for n, c in enumerate(categories)}
+    names = {_whole(path, c, "id", n): str(c.get("name") or "") for n, c in enumerate(categories)}
     masks = {**{image: [] for image in stems}, **found.masks}
     return CocoContent(masks, {k: v for k, v in stems.items() if v}, names or None, found.has_scores)
 
@@ -99,35 +87,61 @@ def _data_set(path: Path, content: dict[str, Any]) -> CocoContent:
 def _burst(path: Path, frames: list[Any]) -> CocoContent:
     masks: dict[str, list[_Mask]] = {}
     for n, frame in enumerate(frames):
-        stem = Path(str(_entry(path, frame, "file_name", n))).stem
-        segments = frame.get("segmentations", [])
-        masks[stem] = [_mask(path, segment, segment.get("rle"), m, "id") for m, segment in enumerate(segments)]
+        stem = Path(_name(path, frame, "file_name", n)).stem
+        segments = _listed(path, frame, "segmentations")
+        masks[stem] = [
+            _mask(path, segment, _entry(path, segment, "rle", m), m, "id") for m, segment in enumerate(segments)
+        ]
     return CocoContent(masks, {stem: stem for stem in masks})
 
 
 def _entry(path: Path, entry: Any, key: str, number: int) -> Any:
-    if not isinstance(entry, dict) or key not in entry:
+    if not isinstance(entry, dict) or entry.get(key) is None:
         raise SequenceProblem(path, f"entry {number} has no {key!r}", _REWRITE)
     return entry[key]
+
+
+def _name(path: Path, entry: Any, key: str, number: int) -> str:
+    """Return a name or number of an entry as text."""
+    value = _entry(path, entry, key, number)
+    if not isinstance(value, str | int) or isinstance(value, bool):
+        raise SequenceProblem(path, f"entry {number} has a {key!r} that is no name or whole number", _REWRITE)
+    return str(value)
+
+
+def _whole(path: Path, entry: Any, key: str, number: int, default: int | None = None, limit: int = _MAX_CLASS) -> int:
+    """Return a whole number of an entry, also where it is written as text."""
+    value = default if default is not None and entry.get(key) is None else _entry(path, entry, key, number)
+    try:
+        if isinstance(value, bool) or abs(int(value)) >= limit or float(value) != int(value):
+            raise ValueError(value)
+        return int(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SequenceProblem(path, f"entry {number} has a {key!r} that is no whole number", _REWRITE) from error
+
+
+def _listed(path: Path, content: dict[str, Any], key: str) -> list[Any]:
+    """Return a list of an entry; empty where it has none."""
+    value = content.get(key)
+    if value is not None and not isinstance(value, list):
+        raise SequenceProblem(path, f"has {key!r} that is no list", _REWRITE)
+    return value or []
 
 
 def _mask(path: Path, entry: Any, segmentation: Any, number: int, track: str = "track_id") -> _Mask:
     where = f"{path}: mask {number}"
     if segmentation is None:
         raise SequenceProblem(path, f"entry {number} has no mask, only a box", _REWRITE)
-    try:
-        own = entry.get(track, entry.get("instance_id"))
-        return _Mask(
-            segmentation,
-            int(entry.get("category_id", 0)),
-            float(entry.get("score", 1.0)),
-            None if own is None else int(own),
-            where,
-        )
-    except (TypeError, ValueError) as error:
-        raise SequenceProblem(
-            path, f"entry {number} has a class, score or track that is no number", _REWRITE
-        ) from error
+    if not isinstance(entry, dict):
+        raise SequenceProblem(path, f"entry {number} is no mask", _REWRITE)
+    name = track if entry.get(track) is not None else "instance_id"
+    own = None if entry.get(name) is None else _whole(path, entry, name, number, limit=_MAX_TRACK)
+    score = entry.get("score")
+    if score is not None and (isinstance(score, bool) or not isinstance(score, int | float) or not 0 <= score <= 1e6):
+        raise SequenceProblem(path, f"entry {number} has a score that is no number", _REWRITE)
+    return _Mask(
+        segmentation, _whole(path, entry, "category_id", number, 0), 1.0 if score is None else float(score), own, where
+    )
 
 
 def open_coco_masks(
@@ -152,6 +166,13 @@ def open_coco_masks(
     for key, masks in parsed.masks.items():
         if key in frames:
             by_frame[frames[key]] += [m for m in masks if moving is None or m.class_id in moving]
+    crowded = max(range(len(names)), key=lambda frame: len(by_frame[frame]), default=0)
+    if names and len(by_frame[crowded]) > _MAX_MASKS:
+        raise SequenceProblem(
+            path,
+            f"has {len(by_frame[crowded])} masks in frame {names[crowded]}, more than {_MAX_MASKS}",
+            "leave out those of low score",
+        )
     everything = [mask for masks in by_frame for mask in masks]
     if everything and all(mask.track is not None for mask in everything):
         return TrackedMasks(path, by_frame, size, config.min_score)
@@ -169,7 +190,9 @@ class TrackedMasks(LazyFrames[Int32Array]):
         self.path, self.by_frame, self.size, self.min_score = path, by_frame, size, min_score
         tracks = sorted({m.track for masks in by_frame for m in masks if m.track is not None})
         # Ids start at 0 in some files, which means static here.
-        self.number = {track: track + (1 if tracks[0] <= 0 else 0) - min(tracks[0], 0) for track in tracks}
+        shift = (1 if tracks[0] <= 0 else 0) - min(tracks[0], 0)
+        small = tracks[-1] + shift < 2**31
+        self.number = {track: track + shift if small else place for place, track in enumerate(tracks, start=1)}
 
     def __len__(self) -> int:
         return len(self.by_frame)
@@ -199,14 +222,14 @@ def _detections(path: Path, by_frame: list[list[_Mask]], size: tuple[int, int]) 
 
 
 def _decoded(path: Path, mask: _Mask, size: tuple[int, int]) -> Any:
-    array = decode_rle(mask.segmentation, mask.where)
-    if array.shape != size:
+    found = rle_size(mask.segmentation, mask.where)
+    if found != size:
         raise SequenceProblem(
             path,
-            f"has masks of {array.shape[1]} x {array.shape[0]} px, but the images are {size[1]} x {size[0]} px",
+            f"has masks of {found[1]} x {found[0]} px, but the images are {size[1]} x {size[0]} px",
             "segment the images that are given here",
         )
-    return array
+    return decode_rle(mask.segmentation, mask.where)
 
 
 def _moving(

@@ -58,7 +58,8 @@ def geometric_depth(
     target = folder / "depth" / f"motion-{key}"
     cache = FrameCache(target)
     stored = _stored_structure(cache, tracks)
-    if stored is None:
+    names = [f"{frame:06d}" for frame in range(video.num_frames)]
+    if stored is None or not all(cache.has_map(name, video.image_size) for name in names):
         result = depth_from_motion(video, tracks, is_static, intrinsics, config, reporter, should_stop)
         store_maps(iter(result.depths), video.num_frames, video.image_size, target, "depth maps", reporter, should_stop)
         said = json.dumps([list(result.facts), list(result.warnings)])
@@ -104,7 +105,7 @@ def moving_masks(
     target = folder / "masks" / f"motion-{key}"
     cache = FrameCache(target)
     said = cache.arrays("said", {"said": None})
-    if said is not None and labels_are_stored(target, video.num_frames):
+    if said is not None and labels_are_stored(target, video.num_frames, video.image_size):
         facts, warnings = json.loads(str(said["said"]))
         return open_labels(target, video.num_frames, video.image_size), facts, warnings
     result = motion_masks(video, depths, tracks, intrinsics, config.motion_masks, reporter, should_stop, config)

@@ -13,6 +13,7 @@ Files whose masks carry no number that lasts over time are joined to instances b
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +21,14 @@ from PIL import Image, UnidentifiedImageError
 
 from uni4d_fg.arrays import ImageArray, Int32Array
 from uni4d_fg.config.motion_masks import InstanceConfig
-from uni4d_fg.cues.coco_files import open_coco_masks, read_json
+from uni4d_fg.cues.coco_files import open_coco_masks
 from uni4d_fg.cues.detections import movable_class_ids
-from uni4d_fg.frontend.sequence.decode import read_mask
+from uni4d_fg.frontend.sequence.decode import MAX_PIXELS, read_mask
 from uni4d_fg.frontend.sequence.frames import FileFrames, LazyFrames
 from uni4d_fg.frontend.sequence.layout import MASK_SUFFIXES, frame_numbers, is_visible_file, list_frames, subfolders
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
+from uni4d_fg.reading import MAX_IMAGE_BYTES, check_regular, is_present, list_folder, read_bytes, read_json
 
 _ANNOTATION_FOLDERS = ("Annotations", "pan_pred")
 _DEVA_CLASSES = "pred.json"
@@ -64,10 +66,11 @@ def open_mask_files(
         InputError: If the form is not known, a file cannot be read, the number or size of masks does not fit the
             images, or a class is unknown.
     """
-    if not path.exists():
+    if not is_present(path):
         raise SequenceProblem(path, "no such file or folder", "check the path of the masks")
     names = tuple(frame_names) or tuple(f"{frame:05d}" for frame in range(num_frames))
-    if path.is_file():
+    if not path.is_dir():
+        check_regular(path, "a folder of masks or a COCO .json file")
         if path.suffix.lower() != ".json":
             raise SequenceProblem(path, "is not a known form of masks", "give a folder of masks or a COCO .json file")
         content = read_json(path)
@@ -130,7 +133,7 @@ def _without_classes(
 
 
 def _holds_masks(folder: Path) -> bool:
-    return any(is_visible_file(p) and p.suffix.lower() in MASK_SUFFIXES for p in folder.iterdir())
+    return any(is_visible_file(p) and p.suffix.lower() in MASK_SUFFIXES for p in list_folder(folder))
 
 
 def _object_id(folder: Path) -> int | None:
@@ -164,10 +167,10 @@ def _deva_ids(path: Path, classes: tuple[str, ...], class_names: dict[int, str] 
     if not _is_class_list(content):
         raise SequenceProblem(path, "has no 'annotations' with 'segments_info'", "give DEVA's own file")
     assert isinstance(content, dict)
-    segments = [s for annotation in content["annotations"] for s in annotation["segments_info"]]
     try:
+        segments = [s for annotation in content["annotations"] for s in annotation["segments_info"]]
         return frozenset(int(s["id"]) for s in segments if int(s["category_id"]) in moving)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise SequenceProblem(path, "has a segment without id or category_id", "give DEVA's own file") from error
 
 
@@ -183,9 +186,10 @@ def read_ids(path: Path) -> Int32Array:
         InputError: If the file cannot be read.
     """
     if path.suffix.lower() == ".png":
+        data = read_bytes(path, MAX_IMAGE_BYTES, "a .png file")
         try:
-            with Image.open(path) as image:
-                if image.mode in ("P", "1"):
+            with Image.open(io.BytesIO(data)) as image:
+                if image.mode in ("P", "1") and image.width * image.height <= MAX_PIXELS:
                     return np.asarray(image, np.int32) if image.mode == "P" else np.asarray(image).astype(np.int32)
         except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
             raise SequenceProblem(path, "cannot be decoded as a mask", "replace the file or export it again") from error

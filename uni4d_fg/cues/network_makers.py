@@ -181,7 +181,7 @@ def store_labels(
     Raises:
         OutputError: If one cannot be written.
     """
-    if not labels_are_stored(folder, count):
+    if not labels_are_stored(folder, count, size):
         paths = _label_paths(folder, count)
         reporter.begin(task, count)
         for frame, mask in enumerate(labels):
@@ -192,9 +192,12 @@ def store_labels(
     return open_labels(folder, count, size)
 
 
-def labels_are_stored(folder: Path, count: int) -> bool:
-    """Tell whether all label maps of a video are there."""
-    return FrameCache(folder).is_complete() and all(path.is_file() for path in _label_paths(folder, count))
+def labels_are_stored(folder: Path, count: int, size: tuple[int, int]) -> bool:
+    """Tell whether all label maps of a video of (height, width) are there and undamaged: PNG has checksums."""
+    try:
+        return FrameCache(folder).is_complete() and all(mask.shape == size for mask in open_labels(folder, count, size))
+    except InputError:
+        return False
 
 
 def open_labels(folder: Path, count: int, size: tuple[int, int]) -> MaskFolder:

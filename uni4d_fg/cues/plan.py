@@ -15,6 +15,7 @@ from uni4d_fg.frontend.sequence.model import Video
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.track_files import load_track_file
 from uni4d_fg.optional import import_onnxruntime
+from uni4d_fg.reading import check_regular, is_present
 
 DepthSource = Literal["given", "card", "geometry"]
 MaskSource = Literal["given", "card", "motion", "none"]
@@ -186,5 +187,7 @@ class CueReport:
 
 
 def _check_exists(path: Path) -> None:
-    if not path.exists():
+    if not is_present(path):
         raise SequenceProblem(path, "no such file or folder", "check the path")
+    if not path.is_dir():
+        check_regular(path, "a folder or a .npy file")

@@ -19,16 +19,23 @@ def check_sequence(sequence: Sequence) -> None:
         InputError: With the first thing found wrong.
     """
     count, where = sequence.num_frames, f"sequence {sequence.name}"
+    for name in ("intrinsics", "timestamps", "initial_world_T_cam"):
+        array = getattr(sequence, name)
+        if not (name == "initial_world_T_cam" and array is None) and not (
+            isinstance(array, np.ndarray) and array.dtype.kind in "iuf"
+        ):
+            raise SequenceProblem(where, f"{name} is no array of numbers", "give a NumPy array of floats")
     if count < MIN_FRAMES:
         raise SequenceProblem(where, f"has {count} frame(s)", f"give at least {MIN_FRAMES}")
     for name, found in (("depth maps", len(sequence.depths)), ("masks", len(sequence.masks))):
         if found != count:
             raise SequenceProblem(where, f"has {found} {name}, but there are {count} images", "give one per image")
     intrinsics = sequence.intrinsics
+    shown = intrinsics.tolist() if intrinsics.size <= 4 else intrinsics.shape
     if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
         raise SequenceProblem(
             where,
-            f"intrinsics {intrinsics.tolist()} are not fx, fy, cx, cy with positive focal lengths",
+            f"intrinsics {shown} are not fx, fy, cx, cy with positive focal lengths",
             "give (4,) pixels",
         )
     times = sequence.timestamps
@@ -36,6 +43,14 @@ def check_sequence(sequence: Sequence) -> None:
         raise SequenceProblem(
             where, "timestamps are not one strictly increasing number of seconds per frame", "use the frame index"
         )
+    tracks = sequence.tracks
+    if tracks is not None:
+        if tracks.num_frames != count:
+            raise SequenceProblem(
+                where, f"tracks cover {tracks.num_frames} frames of {count}", "track all frames, and no others"
+            )
+        if ((tracks.query_frame < 0) | (tracks.query_frame >= count)).any():
+            raise SequenceProblem(where, "a track starts in no frame of the video", f"give 0 to {count - 1}")
     if sequence.initial_world_T_cam is not None:
         _check_poses(where, sequence.initial_world_T_cam, count)
 

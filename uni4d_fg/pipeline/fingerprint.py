@@ -9,8 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.frame_checks import checked_image, checked_mask, floating_depth
 from uni4d_fg.frontend.sequence.model import Sequence
+
+_Check = Callable[[Any, tuple[int, int], str], np.ndarray]
+_CHECKS: dict[str, _Check] = {"image": checked_image, "depth": floating_depth, "mask": checked_mask}
 
 ALGORITHM_VERSION = 2
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""
@@ -29,11 +33,8 @@ def sequence_key(sequence: Sequence, should_stop: Callable[[], bool] | None = No
             raise Cancelled("stopped while reading the sequence")
         for name, source in (("image", sequence.images), ("depth", sequence.depths), ("mask", sequence.masks)):
             array = source[frame]
-            if array.shape[:2] != sequence.image_size:
-                raise InputError(
-                    f"sequence {sequence.name}: {name} of frame {frame} is {array.shape[:2]}, but the images are "
-                    f"{sequence.image_size} (height, width); give every frame the same size"
-                )
+            # Sources of the caller's own may hold anything; what comes after relies on shapes and types.
+            _CHECKS[name](array, sequence.image_size, f"sequence {sequence.name}: {name} of frame {frame}")
             _update(digest, array)
     _update(digest, sequence.intrinsics)
     if not sequence.lens.is_pinhole:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from uni4d_fg.files import write_failure
+from uni4d_fg.results import run_contents
 from uni4d_fg.results.run_folder import RunFolder
-
-_TEMPORARY = re.compile(r"\.tmp-[0-9a-f]{8}-(?P<name>.+)")
 
 
 def remove_leftovers(folder: RunFolder) -> None:
@@ -17,15 +15,7 @@ def remove_leftovers(folder: RunFolder) -> None:
     Raises:
         OutputError: If one cannot be removed.
     """
-    results = (folder.reconstruction, folder.trajectory, folder.depth, folder.summary, folder.config, folder.labels)
-    names = {path.name for path in results}
-    stages, clouds, pictures = folder.root / "stages", folder.static_cloud.parent, folder.trajectory_picture.parent
-    for parent in (folder.root, stages, folder.graphs, clouds, folder.dynamic_cloud(0).parent, pictures):
-        for path in parent.glob(".tmp-*") if parent.is_dir() else ():
-            temporary = _TEMPORARY.fullmatch(path.name)
-            ours = temporary is not None and (parent != folder.root or temporary["name"] in names)
-            if ours and path.is_file():
-                _remove(path)
+    run_contents.remove_leftovers(folder.root)
     _remove(folder.summary)
 
 
@@ -37,7 +27,7 @@ def remove_views(folder: RunFolder) -> None:
     """
     dynamic = folder.dynamic_cloud(0).parent
     pictures = (folder.trajectory_picture, folder.depth_picture, folder.scene_picture)
-    for path in (folder.static_cloud, *sorted(dynamic.glob("*.ply")), *pictures):
+    for path in (folder.static_cloud, *sorted(dynamic.glob("[0-9]*.ply")), *pictures):
         _remove(path)
 
 

@@ -43,6 +43,7 @@ from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.labels_io import load_labels, save_labels
+from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.windows.plan import Window, windows_of
 
@@ -154,15 +155,28 @@ def reconstruct(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    with run_lock(run_dir):
+        mark_run(run_dir)
+        return _reconstruct(
+            sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False), cues or {},
+            additions, measurements or MeasurementFiles(), imu,
+        )  # fmt: skip
+
+
+def _reconstruct(
+    sequence: Sequence, run_dir: Path, config: Config, resume: bool, reporter: Reporter,
+    should_stop: Callable[[], bool], cues: dict[str, Any], additions: Iterable[FactorSource],
+    measurements: MeasurementFiles, imu: ImuSamples | None,
+) -> RunSummary:  # fmt: skip
     recorder = RecordingRunner(stage_runner(config))
-    measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
+    measured = read_measurements(measurements, sequence.timestamps, config.measurements)
     sources = (*additions, *measured.sources)
     run_stage = with_additions(recorder, sources)
     windows = windows_of(config, sequence.num_frames)
     if imu is not None:
         check_goes_with_imu(config, len(windows))
         imu.check_covers(sequence.timestamps)
-        cues = None if cues is None else metric_cues(cues)
+        cues = metric_cues(cues) if cues else cues
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
     summary = RunSummary(
@@ -173,12 +187,12 @@ def reconstruct(
             "image_size": [height, width],
         },
         solver_facts(config),
-        cues=cues or {},
-        warnings=[*(cues or {}).get("warnings", []), *measured.warnings],
+        cues=cues,
+        warnings=[*cues.get("warnings", []), *measured.warnings],
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter or SilentReporter(), should_stop or (lambda: False), summary, recorder, sources, imu,
+        reporter, should_stop, summary, recorder, sources, imu,
     )  # fmt: skip
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
@@ -301,7 +315,10 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
 
 def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> None:
     expected = (run.sequence.num_frames, *run.sequence.image_size)
-    if run.resume and not _readable(lambda: read_depth(run.folder.depth), lambda depth: depth.array.shape == expected):
+    stored = run.folder.depth
+    if run.resume and not _readable(
+        lambda: read_depth(stored, whole=True), lambda found: found.array.shape == expected
+    ):
         run.store.discard("fusion")
 
     def compute(hooks: Hooks) -> StageRecord:

@@ -27,6 +27,7 @@ from uni4d_fg.pipeline.inertial import imu_fact, imu_summary
 from uni4d_fg.pipeline.rigid import rigid_objects_part
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
+from uni4d_fg.pipeline.warnings import scene_warnings
 from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy, energy_of
@@ -173,23 +174,13 @@ def bundle_summary(
     sequence: Sequence, arrays: Arrays, num_observations: int, dropped: dict[str, int], solves: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """Return what ``summary.json`` says of stage 2, from its record's arrays."""
-    (fx, fy), landmarks, first = arrays["intrinsics"][:2], arrays["landmarks"], arrays["world_T_cam"][0, :3, 3]
+    (fx, fy), landmarks = arrays["intrinsics"][:2], arrays["landmarks"]
     pixel, relative = arrays["noise"]
     facts = [
         f"{len(landmarks)} landmarks, {num_observations} observations, "
         f"fx {fx:.1f} fy {fy:.1f} px, noise {pixel:.2f} px, depth {100 * relative:.1f} %"
     ]
-    warnings = []
-    change = float(np.abs(arrays["intrinsics"][:2] / sequence.intrinsics[:2] - 1.0).max())
-    if change > 0.15:
-        warnings.append(f"the focal lengths moved by {100 * change:.0f} % from the given ones")
-    baseline = np.linalg.norm(arrays["world_T_cam"][:, :3, 3] - first, axis=1).max()
-    depth = float(np.median(np.linalg.norm(landmarks - first, axis=1)))
-    if baseline < 0.01 * depth:
-        warnings.append(
-            f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
-            "depth comes from the cue alone, and the focal length is poorly determined"
-        )
+    warnings = scene_warnings(sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks)
     return {"solves": solves, "dropped": dropped, "facts": facts, "warnings": warnings}
 
 

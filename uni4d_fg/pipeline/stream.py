@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,10 @@ from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.stream_folder import StreamFolder
+from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
+from uni4d_fg.pipeline.warnings import scene_warnings
+from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor
@@ -42,24 +45,26 @@ class StreamSummary:
     seconds: dict[str, float]
     """Of this process, per part and in all."""
     peak_memory_mb: float
+    doubts: list[str] = field(default_factory=list)
+    """What to distrust in the result, one sentence each."""
+    bridged: int = 0
+    """Frames of the result that were bridged, those of earlier processes too."""
     facts: list[str] = field(default_factory=list)
     """What measurements there were."""
-    measurement_warnings: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         return {
             "sequence": {"name": self.name, "num_frames": self.num_frames},
-            "stages": {"stream": {**self.__dict__, "name": "stream"}},
+            "stages": {"stream": {**{k: v for k, v in self.__dict__.items() if k != "doubts"}, "name": "stream"}},
             "warnings": self.warnings(),
             "versions": versions(),
         }
 
     def warnings(self) -> list[str]:
         """Return what to distrust."""
-        bridged = self.counts.get(FrameStatus.BRIDGED.value, 0)
-        text = f"{bridged} frame(s) had too few static tracks and are bridged by constant velocity"
-        return [*([text] if bridged else []), *self.measurement_warnings]
+        text = f"{self.bridged} frame(s) had too few static tracks and are bridged by constant velocity"
+        return [*([text] if self.bridged else []), *self.doubts]
 
     def lines(self) -> list[str]:
         """Return a few lines of text."""
@@ -105,13 +110,25 @@ def stream_sequence(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
-    remove_leftovers(RunFolder(run_dir))
-    folder = StreamFolder(run_dir)
-    folder.remove_leftovers()
-    measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
-    sources = (*additions, *measured.sources)
+    with run_lock(run_dir):
+        mark_run(run_dir)
+        measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
+        sources = (*additions, *measured.sources)
+        summary = _stream(sequence, run_dir, config, resume, on_frame, should_stop, sources)
+        summary = replace(summary, facts=measured.facts, doubts=[*summary.doubts, *measured.warnings])
+        atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
+        return summary
+
+
+def _stream(
+    sequence: Sequence, run_dir: Path, config: Config, resume: bool, on_frame: OnFrame | None,
+    should_stop: Callable[[], bool] | None, sources: tuple[FactorSource, ...],
+) -> StreamSummary:  # fmt: skip
+    folder, key = StreamFolder(run_dir), StreamKey(sequence, config, sources)
     solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder, sources)
-    resumed = folder.resume(solver, config) if resume else False
+    # What is there is touched only when it is known that this goes on from it, or replaces it.
+    resumed = folder.resume(solver, key, should_stop) if resume else False
+    remove_leftovers(RunFolder(run_dir))
     if not resumed:
         RunFolder(run_dir).trajectory.unlink(missing_ok=True)
         folder.checkpoint.unlink(missing_ok=True)
@@ -121,12 +138,11 @@ def stream_sequence(
     seconds: dict[str, float] = {}
     for frame in range(first, sequence.num_frames):
         if should_stop is not None and should_stop():
-            folder.save(solver, config)
+            folder.save(solver, key)
             raise Cancelled(f"stopped before frame {frame}; --resume goes on from there")
-        update = solver.add_frame(
-            sequence.images[frame], sequence.depths[frame], sequence.masks[frame], _tracks(sequence, frame),
-            float(sequence.timestamps[frame]),
-        )  # fmt: skip
+        image, depth, mask = sequence.images[frame], sequence.depths[frame], sequence.masks[frame]
+        update = solver.add_frame(image, depth, mask, _tracks(sequence, frame), float(sequence.timestamps[frame]))
+        key.take(image, depth, mask)
         counts[update.status.value] = counts.get(update.status.value, 0) + 1
         for part, value in update.seconds.items():
             seconds[part] = seconds.get(part, 0.0) + value
@@ -134,16 +150,19 @@ def stream_sequence(
             on_frame(update)
         if (frame + 1) % config.incremental.checkpoint_interval == 0:
             since = time.perf_counter()
-            folder.save(solver, config)
+            folder.save(solver, key)
             seconds["checkpoint"] = seconds.get("checkpoint", 0.0) + time.perf_counter() - since
-    folder.save(solver, config)
+    folder.save(solver, key)
     reconstruction = solver.finish()
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began
-    summary = StreamSummary(
-        sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), measured.facts, measured.warnings
+    doubts = scene_warnings(
+        sequence.intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks
     )
-    atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
+    bridged = sum(frame.status is FrameStatus.BRIDGED for frame in folder.frames())
+    summary = StreamSummary(
+        sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), doubts, bridged
+    )
     return summary
 
 

@@ -7,20 +7,19 @@ trajectory is appended line by line as frames leave the window, for whoever watc
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.config.models import Config
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npz, save_npz, write_failure
 from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry.se3 import orthonormalize
 from uni4d_fg.geometry.trajectory import Trajectory
-from uni4d_fg.optim.added_factors import fingerprints
 from uni4d_fg.pipeline.stream_checkpoint import restore, result_arrays, results_of, state_arrays
+from uni4d_fg.pipeline.stream_key import StreamKey
+from uni4d_fg.reading import is_present
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FinishedFrame, Landmarks
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor
@@ -59,31 +58,36 @@ class StreamFolder:
         if frames:
             self._append(frames)
 
-    def save(self, solver: IncrementalReconstructor, config: Config) -> None:
+    def save(self, solver: IncrementalReconstructor, key: StreamKey) -> None:
         """Write a part and the checkpoint.
 
         Raises:
             OutputError: If one of them cannot be written.
         """
         self._write_part()
-        key = np.array(_key(solver, config))
-        save_npz(self.checkpoint, key=key, num_parts=np.array(self.num_parts), **state_arrays(solver))
+        save_npz(
+            self.checkpoint, key=np.array(key.selection), consumed=np.array(key.consumed),
+            num_parts=np.array(self.num_parts), **state_arrays(solver),
+        )  # fmt: skip
 
-    def resume(self, solver: IncrementalReconstructor, config: Config) -> bool:
+    def resume(
+        self, solver: IncrementalReconstructor, key: StreamKey, should_stop: Callable[[], bool] | None = None
+    ) -> bool:
         """Bring a new solver to the last checkpoint; False if there is none.
 
         Raises:
-            InputError: If the checkpoint is damaged, or of another configuration or sequence.
+            InputError: If the checkpoint is damaged, or of another configuration, selection or sequence.
             OutputError: If the trajectory cannot be written.
+            Cancelled: If ``should_stop`` turned true.
         """
-        if not self.checkpoint.exists():
+        if not is_present(self.checkpoint):
             return False
-        arrays = load_npz(self.checkpoint, {"key": None, "num_parts": None})
-        if str(arrays.pop("key")) != _key(solver, config):
-            raise InputError(
-                f"{self.checkpoint}: was written with another configuration, sequence or measurements; use those "
-                "again, or start anew with --overwrite"
-            )
+        arrays = load_npz(self.checkpoint, {"key": None, "consumed": None, "num_parts": 0, "num_frames": 0})
+        try:
+            selection, consumed = str(arrays.pop("key")), str(arrays.pop("consumed"))
+            key.check(selection, consumed, int(arrays["num_frames"]), should_stop)
+        except InputError as error:
+            raise InputError(f"{self.checkpoint}: {error}") from error
         self.num_parts = int(arrays.pop("num_parts"))
         restore(solver, arrays)
         self._rewrite_trajectory()
@@ -92,18 +96,6 @@ class StreamFolder:
     def close(self) -> None:
         """Write what is left as a last part."""
         self._write_part()
-
-    def remove_leftovers(self) -> None:
-        """Remove temporary files of parts that a killed process could not remove.
-
-        Raises:
-            OutputError: If one cannot be removed.
-        """
-        for path in self.part(0).parent.glob(".tmp-*.npz"):
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:
-                raise write_failure(path, error) from error
 
     def frames(self) -> Iterator[FinishedFrame]:
         """Read all finished frames in order."""
@@ -147,10 +139,3 @@ class StreamFolder:
             write_tum(path, Trajectory(np.array([f.timestamp for f in frames]), poses))
         else:
             path.unlink(missing_ok=True)
-
-
-def _key(solver: IncrementalReconstructor, config: Config) -> str:
-    digest = hashlib.blake2b(config.model_dump_json(exclude={"output", "fusion"}).encode(), digest_size=16)
-    digest.update(f"{solver.image_size} {solver.window.prior_intrinsics.tolist()}".encode())
-    digest.update("".join(fingerprints(solver.window.sources)).encode())
-    return digest.hexdigest()

@@ -62,12 +62,14 @@ class WindowedRun:
     def record(self, name: str, window: Window, key: str, compute: Callable[[], StageRecord]) -> StageRecord:
         """Return one window's record: the stored one of the same key when resuming, else computed and stored.
 
+        The last window is always solved: its factor graph is that of the step, and not part of the record.
+
         Raises:
             Cancelled: If the user interrupts; finished windows are kept.
             OutputError: If it cannot be written.
         """
         file = f"{name}_{window.start:06d}"
-        found = self.store.load(file, key) if self.resume else None
+        found = self.store.load(file, key) if self.resume and window is not self.windows[-1] else None
         if found is None:
             self.check_cancelled()
             found = compute()

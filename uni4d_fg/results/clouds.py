@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,7 +12,10 @@ from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.errors import InputError, OutputError
 from uni4d_fg.files import atomic_path
 from uni4d_fg.optional import import_open3d
+from uni4d_fg.reading import check_regular
 from uni4d_fg.results.run_folder import RunFolder
+
+_MAX_PLY_HEADER = 4096
 
 
 def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
@@ -50,16 +54,21 @@ def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
         InputError: If the file is missing or no PLY.
         MissingDependencyError: If Open3D cannot be loaded.
     """
+    size = check_regular(path, "a PLY file")
+    with open(path, "rb") as stream:
+        announced = re.search(rb"\nelement vertex (\d{1,20})\r?\n", stream.read(_MAX_PLY_HEADER))
+    if announced is not None and int(announced[1]) > size:
+        raise InputError(f"{path}: announces {int(announced[1])} points in {size} bytes; make the clouds again")
     open3d = import_open3d()
-    if not path.exists():
-        raise InputError(f"{path}: no such file; a PLY file is expected here")
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.io.read_point_cloud(str(path))
     points = np.asarray(cloud.points, dtype=np.float64).reshape(-1, 3)
     colors = np.asarray(cloud.colors, dtype=np.float64).reshape(-1, 3)
     if colors.shape != points.shape:
         colors = np.ones_like(points)
-    return points, np.rint(colors * 255.0).astype(np.uint8)
+    if not (np.isfinite(points).all() and np.isfinite(colors).all()):
+        raise InputError(f"{path}: has points or colours that are NaN or infinite; make the clouds again")
+    return points, np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def write_clouds(

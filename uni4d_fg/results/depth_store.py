@@ -6,6 +6,7 @@ would end the process without a message when the disk is full; a plain write rai
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import atomic_path, load_npy
+from uni4d_fg.files import atomic_path, load_checksums, load_npy, write_checksums
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 
 
@@ -29,7 +30,8 @@ class DepthWriter:
     start: int
     num_frames: int
     image_size: tuple[int, int]
-    written: set[int] = field(default_factory=set)
+    written: dict[int, int] = field(default_factory=dict)
+    """Frame to the checksum of its map."""
 
     def write(self, frame: int, depth: npt.NDArray[np.floating]) -> None:
         """Store one map (H, W), metres; values that are not positive and finite are stored as NaN.
@@ -45,7 +47,7 @@ class DepthWriter:
             stored = np.where(np.isfinite(depth) & (depth > 0.0), depth, np.nan).astype("<f4")
         self.stream.seek(self.start + frame * stored.nbytes)
         self.stream.write(stored.tobytes())
-        self.written.add(frame)
+        self.written[frame] = zlib.crc32(stored.tobytes())
 
 
 @contextmanager
@@ -67,13 +69,40 @@ def write_depth(path: Path, num_frames: int, image_size: tuple[int, int]) -> Ite
             np.lib.format.write_array_header_1_0(stream, header)
             writer = DepthWriter(stream, stream.tell(), num_frames, image_size)
             yield writer
+            height, width = image_size
+            stream.seek(writer.start + 4 * num_frames * height * width)
+            write_checksums(stream, (writer.written.get(frame, 0) for frame in range(num_frames)))
         if len(writer.written) != num_frames:
-            absent = min(set(range(num_frames)) - writer.written)
+            absent = min(set(range(num_frames)) - set(writer.written))
             raise ValueError(f"{path}: depth of frame {absent} was not written")
 
 
-def read_depth(path: Path) -> ArrayFrames:
+@dataclass(frozen=True)
+class StoredDepth(ArrayFrames):
+    """Memory-mapped depth maps; a map whose checksum does not fit raises InputError when it is read."""
+
+    path: Path
+    checksums: npt.NDArray[np.uint32] | None
+
+    def __getitem__(self, frame: int) -> Float32Array:
+        depth: Float32Array = np.ascontiguousarray(self.array[frame])
+        if self.checksums is not None and zlib.crc32(depth.data) != self.checksums[frame]:
+            raise InputError(
+                f"{self.path}: the depth of frame {frame % len(self)} is damaged, its checksum does not fit; make it "
+                "again: run the same reconstruction with --resume"
+            )
+        return depth
+
+    def __iter__(self) -> Iterator[Float32Array]:
+        return (self[frame] for frame in range(len(self)))
+
+
+def read_depth(path: Path, *, whole: bool = False) -> StoredDepth:
     """Return the depth maps of a run as T frames (H, W), float32 metres, memory-mapped; NaN where missing.
+
+    Args:
+        path: The ``depth.npy`` of the run.
+        whole: Compare the checksums of all frames at once, and demand that there are some.
 
     Raises:
         InputError: If the file is missing, damaged or not (T, H, W) float32.
@@ -81,5 +110,12 @@ def read_depth(path: Path) -> ArrayFrames:
     array = load_npy(path, memory_map=True)
     if array.ndim != 3 or array.dtype != np.float32:
         raise InputError(f"{path}: holds {array.dtype} {array.shape}, expected float32 (T, H, W)")
-    frames: Float32Array = array
-    return ArrayFrames(frames)
+    checksums = load_checksums(path)
+    if checksums is not None and len(checksums) != len(array):
+        checksums = None
+    if whole and checksums is None:
+        raise InputError(f"{path}: has no checksums; make it again")
+    frames = StoredDepth(array, path, checksums)
+    for _ in frames if whole else ():
+        pass
+    return frames

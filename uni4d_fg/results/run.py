@@ -8,7 +8,6 @@ is. ``need_...`` raises instead: for files that must be whole.
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +24,7 @@ from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.labels_io import load_labels
 from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.results.summary_file import read_summary
 from uni4d_fg.slam.reconstruction import Reconstruction
 
 ValueT = TypeVar("ValueT")
@@ -81,7 +81,7 @@ class Run:
                 raise InputError(f"{root}: the run is not finished; continue it with its command line and --resume")
             raise InputError(f"{root}: holds no run; give the folder that `uni4d-fg reconstruct` wrote (--out)")
         self.reconstruction: Reconstruction = load_reconstruction(folder.reconstruction)
-        self.summary: dict[str, Any] = _read_summary(folder.summary)
+        self.summary: dict[str, Any] = read_summary(folder.summary)
 
     def with_parts(self, **parts: Any) -> Run:
         """Return the run with other parts: attributes by name; an InputError stands for a part that is not there."""
@@ -209,13 +209,3 @@ class Run:
                 f"{expected[0]} of {expected[2]}x{expected[1]} px"
             )
         return sequence
-
-
-def _read_summary(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error}); run the reconstruction again") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: holds no summary of a run; run the reconstruction again")
-    return value

@@ -195,7 +195,7 @@ def test_no_frames(tmp_path: Path) -> None:
         assert path.stat().st_size > 100
         with pytest.raises(InputError, match=rf"none\{suffix}: {message}"):
             VideoFrames(path)
-    with pytest.raises(InputError, match="no such video file"):
+    with pytest.raises(InputError, match="no such file; a video file"):
         VideoFrames(tmp_path / "absent.mp4")
 
 
@@ -204,5 +204,5 @@ def test_video_that_disappears(tmp_path: Path) -> None:
     frames = VideoFrames(path)
     assert frames[8].mean() > 100
     path.unlink()
-    with pytest.raises(InputError, match="no such video file"):
+    with pytest.raises(InputError, match="no such file; a video file"):
         frames[1]

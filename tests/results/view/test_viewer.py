@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from viewing_samples import browser_page, copied, free_port, opened
 from uni4d_fg import optional
 from uni4d_fg.cli import main
 from uni4d_fg.errors import ConfigError, MissingDependencyError
-from uni4d_fg.results.view.server import check_address, viewer_server
+from uni4d_fg.results.view.server import check_address, is_own_page, viewer_server
 from uni4d_fg.results.view.viewer import Viewer
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'uni4d-fg[view]'")
@@ -190,3 +191,66 @@ def test_notes_reach_the_panel(finished_run: Path, tmp_path: Path) -> None:
         notes = Viewer(server, opened(copy)).panel.notes.content
     assert "the camera hardly moves" in notes
     assert "labels.npz" in notes
+
+
+HOSTILE = (
+    "<iframe srcdoc=\"<script>parent.document.title='taken'</script>\"></iframe>"
+    '<img src=x onerror="alert(1)">{alert(1)}'
+)
+
+
+def test_text_of_a_run_folder_is_no_markup(finished_run: Path, tmp_path: Path) -> None:
+    copy = copied(finished_run, tmp_path)
+    summary = json.loads((copy / "summary.json").read_text())
+    summary["sequence"]["name"] = HOSTILE
+    (copy / "summary.json").write_text(json.dumps({**summary, "warnings": [HOSTILE]}))
+    port = free_port()
+    with viewer_server("127.0.0.1", port, HOSTILE) as server, browser_page() as page:
+        panel = Viewer(server, opened(copy)).panel
+        assert "<iframe" not in panel.notes.content
+        assert "&lt;iframe" in panel.notes.content
+        assert not any(type(handle).__name__ == "GuiMarkdownHandle" for handle in vars(panel).values())
+        page.goto(f"http://127.0.0.1:{port}")
+        page.get_by_text("Frames per second").wait_for(timeout=60_000)
+        page.get_by_text("iframe srcdoc").first.wait_for(timeout=30_000)
+        assert page.locator("iframe").count() == 0
+        assert page.locator("img[src=x]").count() == 0
+        assert page.title() != "taken"
+
+
+@pytest.mark.parametrize(
+    ("host", "asked", "origin", "own"),
+    [
+        ("127.0.0.1", "127.0.0.1:8080", None, True),
+        ("127.0.0.1", "127.0.0.1:8080", "http://127.0.0.1:8080", True),
+        ("127.0.0.1", "localhost:8080", "http://localhost:8080", True),
+        ("::1", "[::1]:8080", "http://[::1]:8080", True),
+        ("127.0.0.1", "127.0.0.1:8080", "http://evil.example", False),
+        ("127.0.0.1", "127.0.0.1:8080", "http://127.0.0.1:9090", False),
+        ("127.0.0.1", "127.0.0.1:8080", "null", False),
+        ("127.0.0.1", "evil.example:8080", "http://evil.example:8080", False),
+        ("127.0.0.1", None, None, False),
+        ("0.0.0.0", "lab.example:8080", "http://lab.example:8080", True),
+        ("0.0.0.0", "lab.example:8080", "http://evil.example", False),
+    ],
+)
+def test_only_the_own_page_may_use_the_server(host: str, asked: str | None, origin: str | None, own: bool) -> None:
+    assert is_own_page(host, asked, origin) is own
+
+
+def test_the_server_refuses_other_origins() -> None:
+    from websockets.asyncio import server as websockets_server
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    before, port = websockets_server.serve, free_port()
+    with viewer_server("127.0.0.1", port, "a run"):
+        assert websockets_server.serve is before
+        with pytest.raises(InvalidStatus) as refused:
+            connect(f"ws://127.0.0.1:{port}", origin="http://evil.example")
+        assert refused.value.response.status_code == 403
+        with connect(f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}"):
+            pass
+        page = urllib.request.Request(f"http://127.0.0.1:{port}", headers={"Host": "evil.example"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(page, timeout=10)

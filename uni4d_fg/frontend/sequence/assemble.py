@@ -28,17 +28,22 @@ def open_images(path: Path, stop: int | None = None) -> ImageFolder | VideoFrame
         path: The folder or file.
         stop: Frames of a video file from this one on are not looked at.
     """
-    if path.is_file():
+    if not path.is_dir():
         return VideoFrames(path, stop)
     paths = list_frames(path, IMAGE_SUFFIXES)
     images = ImageFolder(paths)
-    check_bit_depth(paths[0])
+    check_bit_depth(*sampled(paths))
     return images
+
+
+def sampled(paths: tuple[Path, ...]) -> list[Path]:
+    """Return the first, the middle and the last file of a video."""
+    return list(dict.fromkeys((paths[0], paths[len(paths) // 2], paths[-1])))
 
 
 def open_depth(path: Path, size: tuple[int, int] | None, units_per_metre: float = 1000.0) -> DepthFolder | NpyDepth:
     """Open a folder of depth maps or one ``.npy`` file of images of ``size``. Raises InputError."""
-    if path.is_file():
+    if not path.is_dir():
         return NpyDepth(path, size)
     return DepthFolder(list_frames(path, DEPTH_SUFFIXES), size, units_per_metre)
 
@@ -60,9 +65,9 @@ def check_length(path: Path, num_frames: int) -> None:
         raise SequenceProblem(path, f"has {num_frames} frame(s)", f"give at least {MIN_FRAMES}")
 
 
-def load_tracks(files: SequenceFiles, path: Path) -> RawTracks:
+def load_tracks(files: SequenceFiles, path: Path, num_frames: int) -> RawTracks:
     """Read the tracks of either layout. Raises InputError."""
-    return load_native_tracks(path) if files.layout == "native" else load_uni4d_tracks(path)
+    return load_native_tracks(path, num_frames) if files.layout == "native" else load_uni4d_tracks(path, num_frames)
 
 
 def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> GroundTruth:
@@ -79,7 +84,17 @@ def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> Gr
     Raises:
         InputError: If the file cannot be read or a shape does not match the sequence.
     """
-    arrays = load_npz(path, {}, {"intrinsics": 1, "track_points": 3, "rigid_instance": 1, "world_T_object": 4})
+
+    def check(shapes: dict[str, tuple[int, ...]]) -> None:
+        points = shapes.get("track_points")
+        if points is not None and (num_tracks is None or points != (num_tracks, num_frames, 3)):
+            expected = "there are no tracks" if num_tracks is None else f"({num_tracks}, {num_frames}, 3) is expected"
+            raise SequenceProblem(
+                path, f"track_points has shape {points}, but {expected}", "save one path per track, or none"
+            )
+
+    ranks: dict[str, int | None] = {"intrinsics": 1, "track_points": 3, "rigid_instance": 1, "world_T_object": 4}
+    arrays = load_npz(path, {}, ranks, check)
     intrinsics, points = arrays.get("intrinsics"), arrays.get("track_points")
     instance, poses = arrays.get("rigid_instance"), arrays.get("world_T_object")
     if intrinsics is not None:
@@ -90,13 +105,6 @@ def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> Gr
             )
         intrinsics = intrinsics.astype(np.float64)
     if points is not None:
-        if num_tracks is None or points.shape != (num_tracks, num_frames, 3):
-            expected = "there are no tracks" if num_tracks is None else f"({num_tracks}, {num_frames}, 3) is expected"
-            raise SequenceProblem(
-                path,
-                f"track_points has shape {points.shape}, but {expected}",
-                "save one path per track, or none",
-            )
         points = points.astype(np.float64)
     if instance is not None or poses is not None:
         if instance is None or poses is None or poses.shape != (len(instance), num_frames, 4, 4):
@@ -193,7 +201,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
         masks[0]
     tracks = None
     if files.tracks is not None:
-        tracks = load_tracks(files, files.tracks).to_tracks(num_frames, size)
+        tracks = load_tracks(files, files.tracks, num_frames).to_tracks(num_frames, size)
     root = files.root.resolve()
     return Video(
         name=root.stem if root.is_file() else root.name,

@@ -48,16 +48,16 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
         VaryingIntrinsics: If the frames' matrices differ by more than 1 %.
         InputError: If the file cannot be read or does not hold pinhole matrices without skew.
     """
-    values = load_npy(path).astype(np.float64)
+    values = load_npy(path, memory_map=True)
     if values.ndim not in (2, 3) or values.shape[-2:] != (3, 3) or values.size == 0:
         raise SequenceProblem(path, f"has shape {values.shape}", "save one (3, 3) matrix, or (T, 3, 3)")
-    matrices = values.reshape(-1, 3, 3)
-    if len(matrices) not in (1, num_frames):
+    if values.size // 9 not in (1, num_frames):
         raise SequenceProblem(
             path,
-            f"has {len(matrices)} matrices for {num_frames} frames",
+            f"has {values.size // 9} matrices for {num_frames} frames",
             "save one (3, 3) matrix, or one per frame",
         )
+    matrices = np.array(values, dtype=np.float64).reshape(-1, 3, 3)
     if not np.isfinite(matrices).all():
         raise SequenceProblem(path, "has NaN or infinite entries", "save the calibration again")
     focal = matrices[:, (0, 1), (0, 1)]

@@ -12,6 +12,28 @@ _EBML_HEADER = b"\x1a\x45\xdf\xa3"
 _MATROSKA_SEGMENT = b"\x18\x53\x80\x67"
 
 
+_ISO_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"uuid")
+_OTHER_STARTS = (b"OggS", b"FLV\x01", b"\x30\x26\xb2\x75\x8e\x66\xcf\x11", b"\x00\x00\x01\xba")
+_TRANSPORT_PACKET = 188
+
+
+def is_container(path: Path) -> bool:
+    """Tell whether a file begins as one that holds its video itself.
+
+    Decoders also take lists of other files and addresses for videos, which would be opened for whoever wrote the list.
+    """
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(2 * _TRANSPORT_PACKET + 1)
+    except OSError:
+        return False
+    if start[4:8] in _ISO_BOXES or (start[:4] == b"RIFF" and start[8:12] == b"AVI "):
+        return True
+    if start.startswith((_EBML_HEADER, *_OTHER_STARTS)):
+        return True
+    return len(start) > 2 * _TRANSPORT_PACKET and all(start[i * _TRANSPORT_PACKET] == 0x47 for i in range(3))
+
+
 def missing_bytes(path: Path) -> int:
     """Return how many bytes the container announces beyond the end of the file; 0 if it is whole or says nothing."""
     try:
@@ -21,7 +43,7 @@ def missing_bytes(path: Path) -> int:
     with stream:
         size = path.stat().st_size
         start = stream.read(12)
-        if start[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
+        if start[4:8] in _ISO_BOXES:
             end = _end_of_boxes(stream, size)
         elif start[:4] == b"RIFF" and start[8:12] == b"AVI ":
             end = 8 + int.from_bytes(start[4:8], "little")

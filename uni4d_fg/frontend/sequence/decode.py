@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import io
+import warnings
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array
+from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npy
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
+from uni4d_fg.reading import MAX_IMAGE_BYTES, read_bytes
 
 SATURATED = 65535
 """Value of a 16-bit depth file that means "too far to say"; read as missing."""
 
 MIN_16_BIT_RANGE = 4096
 """A 16-bit video whose first image stays below this is taken for one of fewer bits, which would come out black."""
+
+MAX_PIXELS = 2**27
+"""Pixels of one image or map above which it is refused (134 million)."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
@@ -35,21 +43,34 @@ def _cut_short(data: bytes) -> bool:
 def _decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> npt.NDArray[Any]:
     """Return the pixels of an image file: (H, W) or (H, W, channels), channels BGR(A); by default as stored."""
     remedy = "replace the file or export it again"
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SequenceProblem(path, f"cannot be read ({error.strerror})", "check the file") from error
+    data = read_bytes(path, MAX_IMAGE_BYTES, "an image file")
     if not data:
         raise SequenceProblem(path, "is empty", remedy)
     if _cut_short(data):
         raise SequenceProblem(path, f"is cut short ({len(data)} bytes)", remedy)
+    _check_pixels(path, data)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    except cv2.error as error:
+    except (cv2.error, MemoryError) as error:
         raise SequenceProblem(path, "cannot be decoded as an image", remedy) from error
     if pixels is None:
         raise SequenceProblem(path, "cannot be decoded as an image", remedy)
     return np.asarray(pixels)
+
+
+def _check_pixels(path: Path, data: bytes) -> None:
+    """Refuse an image whose header announces more pixels than any camera takes, before memory is set aside for them."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as image:
+                width, height = image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return  # the decoder says what is wrong with it
+    if width * height > MAX_PIXELS:
+        raise SequenceProblem(
+            path, f"announces {width} x {height} px, more than {MAX_PIXELS} in all", "make the images smaller"
+        )
 
 
 def read_image(path: Path) -> ImageArray:
@@ -74,16 +95,38 @@ def read_image(path: Path) -> ImageArray:
     return np.ascontiguousarray(pixels[:, :, ::-1])
 
 
-def check_bit_depth(path: Path) -> None:
-    """Raise InputError if a 16-bit image, the first of a video, uses so few of its values that it would be black."""
-    pixels = _decode(path, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
-    brightest = int(pixels.max(initial=0))
-    if pixels.dtype == np.uint16 and brightest < MIN_16_BIT_RANGE:
+def check_bit_depth(path: Path, *others: Path) -> None:
+    """Raise InputError if the 16-bit images among some of a video use so few of their values that they would be black.
+
+    One bright image among them is enough: a video may begin or end in the dark.
+    """
+    brightest = []
+    for one in (path, *others):
+        try:
+            pixels = _decode(one, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        except InputError:
+            if one is path:
+                raise
+            continue  # said when it is used
+        if pixels.dtype == np.uint16:
+            brightest.append((int(pixels.max(initial=0)), one))
+    value, darkest = max(brightest, key=lambda found: found[0], default=(MIN_16_BIT_RANGE, path))
+    if value < MIN_16_BIT_RANGE:
         raise SequenceProblem(
-            path,
-            f"is a 16-bit image whose brightest value is {brightest} of 65535, next to black",
+            darkest,
+            f"is a 16-bit image whose brightest value is {value} of 65535, next to black",
             "scale all images by one factor to the whole range, or save them with 8 bits",
         )
+
+
+def is_16_bit_png(path: Path) -> bool:
+    """Tell whether a file begins as a PNG of 16 bits per channel does."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(25)
+    except OSError:
+        return False
+    return start.startswith(_PNG_SIGNATURE) and start[24:] == b"\x10"
 
 
 def clean_depth(depth: npt.NDArray[Any]) -> Float32Array:
@@ -109,7 +152,7 @@ def read_depth(path: Path, units_per_metre: float = 1000.0) -> Float32Array:
         InputError: If the file cannot be read or is not a depth map.
     """
     if path.suffix.lower() == ".npy":
-        values = load_npy(path)
+        values = _load_map(path)
         if values.ndim == 3 and values.shape[0] == 1:
             values = values[0]
         if values.ndim != 2 or values.dtype.kind != "f":
@@ -130,6 +173,14 @@ def read_depth(path: Path, units_per_metre: float = 1000.0) -> Float32Array:
     return depth
 
 
+def _load_map(path: Path) -> npt.NDArray[Any]:
+    """Return one map of a ``.npy`` file; it is read only when its values are used, after its shape was looked at."""
+    values = load_npy(path, memory_map=True)
+    if values.size > MAX_PIXELS:
+        raise SequenceProblem(path, f"has shape {values.shape}, more than {MAX_PIXELS} pixels", "make the maps smaller")
+    return values
+
+
 def read_mask(path: Path) -> Int32Array:
     """Read a label map.
 
@@ -144,7 +195,7 @@ def read_mask(path: Path) -> Int32Array:
         InputError: If the file cannot be read or is not a label map.
     """
     if path.suffix.lower() == ".npy":
-        values = load_npy(path)
+        values = _load_map(path)
         if values.ndim != 2 or values.dtype.kind not in "biu":
             raise SequenceProblem(path, f"has shape {values.shape} of {values.dtype}", "save it as (H, W) integer ids")
         if values.size and (int(values.min()) < 0 or int(values.max()) > np.iinfo(np.int32).max):

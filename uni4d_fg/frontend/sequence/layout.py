@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, TypedDict
 
 from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
+from uni4d_fg.reading import check_regular, is_present, list_folder
 
 LayoutName = Literal["native", "uni4d"]
 Layout = Literal["auto", "native", "uni4d"]
@@ -64,20 +65,20 @@ class SequenceFiles:
 
 def check_root(root: Path) -> None:
     """Raise InputError unless ``root`` is an existing folder."""
-    if not root.exists():
+    if not is_present(root):
         raise SequenceProblem(root, "no such folder", "check the path")
     if not root.is_dir():
         raise SequenceProblem(root, "is a file", "give the folder that holds the sequence")
 
 
 def existing(path: Path) -> Path | None:
-    """Return ``path`` if it exists, else None."""
-    return path if path.exists() else None
+    """Return ``path`` if it exists, else None. Raises InputError for a link that leads nowhere."""
+    return path if is_present(path) else None
 
 
 def subfolders(root: Path) -> list[Path]:
     """Return the visible folders in ``root``, sorted by name."""
-    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return [p for p in list_folder(root) if p.is_dir() and not p.name.startswith(".")]
 
 
 def find_images(root: Path) -> Path | None:
@@ -86,17 +87,22 @@ def find_images(root: Path) -> Path | None:
     That is ``rgb/``, or a video file of one of the names, or the folder itself if it holds image files.
     """
     folder = root / "rgb"
-    if folder.is_dir():
+    if is_present(folder) and folder.is_dir():
         return folder
-    video = next((root / name for name in VIDEO_NAMES if (root / name).is_file()), None)
+    video = next((root / name for name in VIDEO_NAMES if is_present(root / name)), None)
     if video is not None:
+        check_regular(video, "a video file")
         return video
-    return root if any(is_visible_file(p) and p.suffix.lower() in IMAGE_SUFFIXES for p in root.iterdir()) else None
+    found = any(is_visible_file(p) and p.suffix.lower() in IMAGE_SUFFIXES for p in list_folder(root))
+    return root if found else None
 
 
 def is_visible_file(path: Path) -> bool:
-    """Tell whether ``path`` is a file whose name does not begin with a dot."""
-    return not path.name.startswith(".") and path.is_file()
+    """Tell whether ``path`` is something else than a folder whose name does not begin with a dot.
+
+    Whether it can be read as a file is found out when it is: a pipe, or a link to nothing, is not passed over.
+    """
+    return not path.name.startswith(".") and not path.is_dir()
 
 
 def missing_images(root: Path) -> SequenceProblem:
@@ -117,7 +123,7 @@ def list_frames(folder: Path, suffixes: Iterable[str]) -> tuple[Path, ...]:
     accepted = tuple(suffixes)
     if not folder.is_dir():
         raise SequenceProblem(folder, "is not a folder", f"make it a folder of {', '.join(accepted)} files")
-    names = sorted(p.name for p in folder.iterdir() if is_visible_file(p))
+    names = [p.name for p in list_folder(folder) if is_visible_file(p)]
     frames = tuple(folder / name for name in names if Path(name).suffix.lower() in accepted)
     if not frames:
         found = f"it holds {some_of(names, 3)}" if names else "it is empty"

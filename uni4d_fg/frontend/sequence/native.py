@@ -15,6 +15,7 @@ from uni4d_fg.frontend.sequence.layout import (
 )
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
+from uni4d_fg.reading import is_present
 
 DEFAULT_DEPTH = "depth_cue"
 
@@ -22,8 +23,8 @@ DEFAULT_DEPTH = "depth_cue"
 def _depth_candidates(root: Path, depth: str | None) -> list[Path]:
     """Return what goes by the name ``depth`` here (by default the usual ones): a folder, a ``.npy`` file, or both."""
     name = depth or DEFAULT_DEPTH
-    found = [path for path in (root / name, root / f"{name}.npy") if path.exists()]
-    if not found and name == DEFAULT_DEPTH and (root / "depth.npy").exists():
+    found = [path for path in (root / name, root / f"{name}.npy") if is_present(path)]
+    if not found and name == DEFAULT_DEPTH and is_present(root / "depth.npy"):
         return [root / "depth.npy"]
     return found
 

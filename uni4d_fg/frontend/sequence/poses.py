@@ -10,6 +10,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.files import load_npy
 from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
 from uni4d_fg.geometry.se3 import orthonormalize
+from uni4d_fg.reading import read_text
 
 MAX_ROTATION_ERROR = 1e-3
 """Largest entry of R R^T - I that is taken for rounding (and removed)."""
@@ -30,11 +31,12 @@ def load_poses(path: Path, num_frames: int) -> FloatArray:
     Raises:
         InputError: If the file cannot be read, has another shape, or holds anything but rigid transforms.
     """
-    poses = load_npy(path).astype(np.float64)
-    if poses.shape != (num_frames, 4, 4):
+    stored = load_npy(path, memory_map=True)
+    if stored.shape != (num_frames, 4, 4):
         raise SequenceProblem(
-            path, f"has shape {poses.shape} for {num_frames} frames", f"save poses as ({num_frames}, 4, 4)"
+            path, f"has shape {stored.shape} for {num_frames} frames", f"save poses as ({num_frames}, 4, 4)"
         )
+    poses: FloatArray = np.array(stored, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
     if bad.size:
         raise SequenceProblem(
@@ -78,10 +80,7 @@ def load_timestamps(path: Path, num_frames: int) -> FloatArray:
         InputError: If the file cannot be read, a line is not a number, the count differs from ``num_frames``,
             or the times do not increase strictly.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SequenceProblem(path, f"cannot be read ({error})", "write one number of seconds per line") from error
+    lines = read_text(path).splitlines()
     times: list[float] = []
     for number, line in enumerate(lines, start=1):
         text = line.strip()

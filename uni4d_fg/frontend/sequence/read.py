@@ -19,6 +19,7 @@ from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.native import find_native_files, is_native_layout
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.uni4d_layout import find_uni4d_files, is_uni4d_layout
+from uni4d_fg.reading import check_regular, is_present
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -66,9 +67,10 @@ def find_files(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOpti
     """
     if layout not in ("auto", "native", "uni4d"):
         raise SequenceProblem(root, f"unknown layout {layout!r}", "choose auto, native or uni4d")
-    if not root.exists():
+    if not is_present(root):
         raise SequenceProblem(root, "no such folder or file", "check the path")
-    if root.is_file():
+    if not root.is_dir():
+        check_regular(root, "a folder or a video file")
         return _video_file(root, options)
     name = detect_layout(root, options.get("depth")) if layout == "auto" else layout
     if name == "uni4d":

@@ -51,8 +51,9 @@ class FrameSelection:
 
     def indices(self, num_frames: int) -> IntArray:
         """Return the selected frames of a video of ``num_frames``, increasing."""
+        # Python's numbers have no largest one, those of arrays do.
         stop = num_frames if self.stop is None else min(self.stop, num_frames)
-        return np.arange(self.start, stop, self.stride, dtype=np.int64)
+        return np.arange(min(self.start, num_frames), stop, min(self.stride, num_frames + 1), dtype=np.int64)
 
 
 def select_frames(video: Video, selection: FrameSelection) -> Video:

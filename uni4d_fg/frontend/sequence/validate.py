@@ -13,7 +13,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence import assemble, naming
 from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, implausible, load_intrinsics
-from uni4d_fg.frontend.sequence.decode import check_bit_depth
+from uni4d_fg.frontend.sequence.decode import MIN_16_BIT_RANGE, check_bit_depth, is_16_bit_png
 from uni4d_fg.frontend.sequence.frames import FileFrames, ImageFolder, LazyFrames
 from uni4d_fg.frontend.sequence.layout import IMAGE_SUFFIXES, Layout, LayoutOptions, SequenceFiles, list_frames
 from uni4d_fg.frontend.sequence.poses import load_poses, load_timestamps
@@ -105,11 +105,24 @@ class _Validation:
         else:
             self._frame_times(images)
 
+        black: list[int] = []
+
         def visit(frame: int, image: npt.NDArray[np.uint8]) -> None:
-            if frame == 0 and isinstance(images, ImageFolder):
-                self.findings.attempt("images", lambda: check_bit_depth(images.paths[0]))
+            if not isinstance(images, ImageFolder):
+                return
+            if frame == 0:
+                self.findings.attempt("images", lambda: check_bit_depth(*assemble.sampled(images.paths)))
+            if int(image.max(initial=0)) < MIN_16_BIT_RANGE // 256 and is_16_bit_png(images.paths[frame]):
+                black.append(frame)
 
         scan_frames("images", images, self.findings, visit)
+        if black:
+            self.findings.add(
+                "warning",
+                "images",
+                f"{path}: 16-bit images that are next to black in frame(s) {some_of(black)}",
+                "scale all images by one factor to the whole range, unless these are dark",
+            )
         if self.findings.items[-1].shape:
             self.size = images.size
         self.findings.attempt("images", lambda: assemble.check_length(path, len(images)))
@@ -245,7 +258,7 @@ class _Validation:
         if path is None:
             self.findings.add("info", "tracks", "there are no tracks", "none: the built-in tracker makes them")
             return
-        raw = self.findings.attempt("tracks", lambda: assemble.load_tracks(self.files, path))
+        raw = self.findings.attempt("tracks", lambda: assemble.load_tracks(self.files, path, num_frames))
         if raw is None:
             return
         self.num_tracks = int(raw.visible.shape[0])
@@ -315,7 +328,7 @@ class _Validation:
 
 def _open_images(path: Path) -> ImageFolder | VideoFrames:
     """Open the images even if the first of them is broken: the size is that of the first readable one."""
-    if path.is_file():
+    if not path.is_dir():
         return VideoFrames(path)
     paths = list_frames(path, IMAGE_SUFFIXES)
     for file in paths:

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, ImageArray
-from uni4d_fg.frontend.sequence.containers import missing_bytes
+from uni4d_fg.frontend.sequence.containers import is_container, missing_bytes
 from uni4d_fg.frontend.sequence.frames import LazyFrames
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
+from uni4d_fg.reading import check_regular
 
 _CACHED_FRAMES = 4
 _CACHED_BYTES = 2**27  # when read backwards
@@ -67,10 +68,10 @@ class VideoFrames(LazyFrames[ImageArray]):
         self._length, self.times = self._look_through(stop)
 
     def _open(self) -> None:
-        if not self.path.is_file():
-            raise SequenceProblem(self.path, "no such video file", "check the path")
-        if self.path.stat().st_size == 0:
+        if check_regular(self.path, "a video file") == 0:
             raise SequenceProblem(self.path, "is empty", "copy it again")
+        if not is_container(self.path):
+            raise SequenceProblem(self.path, "cannot be opened as a video", _REMEDY)
         self._capture.release()
         self._capture = _quiet_capture(self.path)
         self._next = 0

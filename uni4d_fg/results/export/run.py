@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -15,10 +14,8 @@ from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.results.export.model import ExportJob, ExportOptions, ExportReport
 from uni4d_fg.results.export.registry import exporter
 from uni4d_fg.results.run import Run
+from uni4d_fg.results.run_contents import EXPORT_MARKER, export_files, foreign_files, is_export
 from uni4d_fg.results.undistort import undistorted
-
-MARKER = "export.json"
-"""In the folder of every export; says what made it, and that it may be replaced."""
 
 
 def export_run(
@@ -81,8 +78,11 @@ def _export(
         if straight:
             job.facts.append(f"undistorted: {run.reconstruction.lens.model} to PINHOLE")
         chosen.write(job)
-        facts = {"format": name, "run": str(run.folder.root.resolve()), "figures": job.figures, "facts": job.facts}
-        atomic_write_json(folder / MARKER, facts)
+        facts = {
+            "format": name, "run": str(run.folder.root.resolve()), "figures": job.figures, "facts": job.facts,
+            "files": export_files(folder),
+        }  # fmt: skip
+        atomic_write_json(folder / EXPORT_MARKER, facts)
     reporter.end()
     return ExportReport(name, target, tuple(job.facts), job.figures, tuple(job.warnings))
 
@@ -91,17 +91,13 @@ def _check_target(target: Path, overwrite: bool) -> None:
     """Raise OutputError if ``target`` is in the way."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
-    if not _is_export(target):
+    if not is_export(target):
         raise OutputError(f"{target}: exists and is no export; choose another --out")
     if not overwrite:
         raise OutputError(f"{target}: exists already; replace it with --overwrite or choose another --out")
-
-
-def _is_export(target: Path) -> bool:
-    try:
-        return bool(json.loads((target / MARKER).read_text(encoding="utf-8")).get("format") == target.name)
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return False
+    foreign = foreign_files(target)
+    if foreign:
+        raise OutputError(f"{target}: holds {foreign[0]}, which is not of the export; move it or choose another --out")
 
 
 @contextmanager

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from uni4d_fg.config.load import dump_config, load_config, preset_names
+from uni4d_fg.config.load import load_config, preset_names, read_yaml
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.results.report.markup import Markup, bullets, element, join, number, section, table
 from uni4d_fg.results.run import Run
@@ -112,13 +111,13 @@ def nearest_preset(config: Path) -> tuple[str, dict[str, tuple[Any, Any]]] | Non
     of both lacks stands as None. None if the file cannot be read.
     """
     try:
-        used = _leaves(yaml.safe_load(config.read_text(encoding="utf-8")))
-    except (OSError, ValueError, yaml.YAMLError):
+        used = _leaves(read_yaml(config))
+    except ConfigError:
         return None
     best: tuple[str, dict[str, tuple[Any, Any]]] | None = None
     for name in sorted(preset_names(), key=lambda preset: preset != "default"):
         try:
-            preset = _leaves(yaml.safe_load(dump_config(load_config(name))))
+            preset = _leaves(load_config(name).model_dump(mode="json"))
         except ConfigError:
             continue
         fields = dict.fromkeys([*used, *preset])

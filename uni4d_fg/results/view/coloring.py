@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from html import escape
@@ -141,6 +142,14 @@ class Coloring:
             + _scale("landmarks: standard deviation from their rays", values.landmark_sigma, factor, unit)
             + _swatch("moving points bridged, not seen", BRIDGED_AMBER)
         )
+
+
+def as_html(lines: Iterable[str]) -> str:
+    """Return lines of plain text as HTML in which nothing of them is markup.
+
+    All text goes to the page this way: a run folder may come from anyone, and Markdown would let it run scripts.
+    """
+    return "".join(_note(line) for line in lines)
 
 
 def _note(text: str) -> str:

@@ -24,7 +24,7 @@ class Panel:
             self.frames_per_second = gui.add_slider(
                 "Frames per second", min=1, max=60, step=1, initial_value=round(min(max(frames_per_second, 1), 60))
             )
-            self.facts = gui.add_markdown("")
+            self.facts = gui.add_html("")
         with gui.add_folder("Colour"):
             self.color = gui.add_dropdown("Colour by", options=tuple(choice.value for choice in ColorBy))
             self.point_size = gui.add_slider("Point size", min=0.2, max=5.0, step=0.1, initial_value=1.0)
@@ -49,7 +49,7 @@ class Panel:
             self.look_through = gui.add_button("Look through the current camera")
             self.follow = gui.add_checkbox("Follow the camera", initial_value=False)
             self.overview = gui.add_button("Whole scene")
-        self.notes = gui.add_markdown("")
+        self.notes = gui.add_html("")
 
     @property
     def color_by(self) -> ColorBy:

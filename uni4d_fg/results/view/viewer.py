@@ -13,7 +13,7 @@ from uni4d_fg.arrays import evenly_spread
 from uni4d_fg.results.measures import scene_depth
 from uni4d_fg.results.pictures.figure import upright_axes
 from uni4d_fg.results.run import Run
-from uni4d_fg.results.view.coloring import ColorBy, Coloring, values_of
+from uni4d_fg.results.view.coloring import ColorBy, Coloring, as_html, values_of
 from uni4d_fg.results.view.content import Limits, RunClouds
 from uni4d_fg.results.view.layers import (
     CameraLayer,
@@ -127,7 +127,7 @@ class Viewer:
 
     def _facts(self, frame: int) -> str:
         reconstruction, values = self._run.reconstruction, self._values
-        parts = [f"**frame {frame}** of {self._run.num_frames}"]
+        parts = [f"frame {frame} of {self._run.num_frames}"]
         if not np.array_equal(reconstruction.timestamps, np.arange(self._run.num_frames)):
             parts[0] += f", {reconstruction.timestamps[frame]:.3f} s"
         if np.isfinite(values.camera_error[frame]):
@@ -135,7 +135,7 @@ class Viewer:
         if np.isfinite(values.position_sigma[frame]):
             factor, unit = self._run.small_unit
             parts.append(f"position ± {factor * values.position_sigma[frame]:.2g} {unit}")
-        return "  \n".join(parts)
+        return as_html(parts)
 
     def _look_through(self, clients: list[Any]) -> None:
         reconstruction = self._run.reconstruction
@@ -195,4 +195,4 @@ def _notes(run: Run, source: str, limits: Limits) -> str:
         lines.append("The run has no clouds: these are made from its depth.")
     if len(run.reconstruction.landmarks) > limits.landmarks:
         lines.append(f"{limits.landmarks} of {len(run.reconstruction.landmarks)} landmarks are shown.")
-    return "\n\n".join(lines)
+    return as_html(lines)

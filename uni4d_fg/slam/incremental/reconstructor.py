@@ -16,6 +16,7 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.optim.backend import choose_backend
 from uni4d_fg.optim.stage import LevenbergMarquardtRunner
+from uni4d_fg.slam.incremental.boundary import Boundary, checked_size, detached
 from uni4d_fg.slam.incremental.dynamic import DynamicWindow, in_world, moving_scales
 from uni4d_fg.slam.incremental.labels import LabelledFrame, TrackBook
 from uni4d_fg.slam.incremental.memory import return_free_memory
@@ -90,7 +91,7 @@ class IncrementalReconstructor:
         intrinsics = np.array(intrinsics, dtype=np.float64)
         if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
             raise InputError(f"intrinsics must be fx, fy, cx, cy in px with positive focal lengths, got {intrinsics}")
-        self.config, self.image_size = config, image_size
+        self.config, self.image_size = config, checked_size(image_size)
         ba = config.bundle_adjustment
         noise = StaticNoise(ba.reprojection_sigma_px, ba.depth_sigma, ba.depth_correlation)
         self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise, sources=tuple(additions))
@@ -102,6 +103,7 @@ class IncrementalReconstructor:
         self.num_frames = 0
         self.last_timestamp = -np.inf
         self.last_pose = np.eye(4)
+        self._boundary = Boundary(self.image_size)
         self._run = LevenbergMarquardtRunner(choose_backend(config.backend))
         self.smoother = make_smoother(incremental, self._run)
         self._seconds: dict[str, float] = {}
@@ -109,7 +111,7 @@ class IncrementalReconstructor:
     @property
     def intrinsics(self) -> FloatArray:
         """(4,) present estimate."""
-        return self.window.intrinsics
+        return self.window.intrinsics.copy()
 
     def add_frame(
         self,
@@ -130,11 +132,18 @@ class IncrementalReconstructor:
                 or before it, changes nothing and is reported as such.
 
         Raises:
-            InputError: If an array has a wrong shape or the timestamp is not finite.
-            SolverError: If the window cannot be solved.
+            InputError: If an array has a wrong shape or type, the timestamp is not finite, or tracks are given for some
+                frames only.
+            SolverError: If the window cannot be solved, a frame before could not be, or the stream was finished.
         """
-        time_now = float(self.num_frames if timestamp is None else timestamp)
-        depth, mask = self._checked(image, depth, mask, time_now)
+        frame = self._boundary.check(self.num_frames, image, depth, mask, tracks, timestamp)
+        with self._boundary.guard():
+            return detached(self._take(*frame))
+
+    def _take(
+        self, image: ImageArray, depth: Float32Array, mask: Int32Array, tracks: FrameTracks | None, time_now: float
+    ) -> FrameUpdate:
+        """Take a frame that is checked."""
         self._seconds = {}
         if time_now <= self.last_timestamp:
             status = FrameStatus.REPEATED if time_now == self.last_timestamp else FrameStatus.OUT_OF_ORDER
@@ -189,7 +198,9 @@ class IncrementalReconstructor:
         )
 
     def flush(self) -> None:
-        """Hand over what is left in the window to ``results``."""
+        """Hand over what is left in the window to ``results``; more frames may not be added."""
+        if self.num_frames:
+            self._boundary.close()
         window = self.window
         frames = [
             finished
@@ -207,21 +218,6 @@ class IncrementalReconstructor:
             self.config, window.prior_intrinsics, window.intrinsics, window.noise,
             intrinsics_covariance=window.intrinsics_covariance, sources=window.sources,
         )  # fmt: skip
-
-    def _checked(
-        self, image: ImageArray, depth: Float32Array, mask: Int32Array | None, timestamp: float
-    ) -> tuple[Float32Array, Int32Array]:
-        where = f"frame {self.num_frames}"
-        mask = np.zeros(self.image_size, dtype=np.int32) if mask is None else mask
-        for name, array in (("image", image), ("depth", depth), ("mask", mask)):
-            if array.shape[:2] != self.image_size or array.ndim > (3 if name == "image" else 2):
-                raise InputError(f"{where}: {name} has shape {array.shape}, the video is {self.image_size}")
-        if image.dtype != np.uint8:
-            raise InputError(f"{where}: the image has dtype {image.dtype}, expected uint8")
-        if not np.isfinite(timestamp):
-            raise InputError(f"{where}: the timestamp {timestamp} is not finite")
-        cue = np.asarray(depth, dtype=np.float32)
-        return np.where(cue > 0, cue, np.float32(np.nan)), np.asarray(mask, dtype=np.int32)
 
     def _pose(self, frame: int, static: LabelledFrame) -> tuple[FramePose | None, int]:
         """Return the pose of a new frame against known points, None if too few agree, and how many agree."""

@@ -1,0 +1,174 @@
+"""What hostile input is made of, and how what becomes of it is judged."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import resource
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hypothesis import strategies as st
+
+from uni4d_fg.cli import main
+from uni4d_fg.errors import Uni4dFgError
+
+TINY_SCENE: dict[str, Any] = {
+    "num_frames": 6,
+    "height": 60,
+    "width": 80,
+    "focal": 75.0,
+    "margin_px": 3.0,
+    "grid_columns": 14,
+    "grid_rows": 10,
+    "query_interval": 4,
+}
+
+SECONDS = 20
+"""A case that takes longer hangs."""
+MEGABYTES = 1536
+"""The process may grow by so much in all cases together."""
+
+KNOWN_CODES = {0, 1, 2, 3, 4, 5, 6, 7, 130}
+
+_start_megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+class Hung(BaseException):
+    """A case did not end; not an Exception, so that nothing takes it for one of its own."""
+
+
+@contextlib.contextmanager
+def watched() -> Iterator[None]:
+    """Fail if the block takes too long or too much memory."""
+
+    def ring(*_: object) -> None:
+        raise Hung(f"did not end within {SECONDS} s")
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - _start_megabytes
+    assert grown < MEGABYTES, f"memory grew to {grown:.0f} MB"
+
+
+def judged(action: Any, *arguments: Any, **named: Any) -> Any:
+    """Call a function: it returns, or raises one clear error of the package. The error is returned then."""
+    with watched():
+        try:
+            return action(*arguments, **named)
+        except Uni4dFgError as error:
+            assert_clear(str(error))
+            return error
+
+
+def judged_verb(*words: object) -> tuple[int, str, str]:
+    """Run a command line in this process; judge its exit code and what it says."""
+    out, err = io.StringIO(), io.StringIO()
+    with watched(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main.run([str(word) for word in words])
+    said = err.getvalue()
+    assert code in KNOWN_CODES, (code, said[-2000:])
+    assert "Traceback" not in said
+    assert "please report this" not in said
+    if code not in (0, 2, 3):  # validate says what it finds on standard output
+        assert said.strip()
+    return code, out.getvalue(), said
+
+
+def assert_clear(message: str) -> None:
+    """Assert that a message is one that a user can do something with."""
+    assert message.strip()
+    assert "Traceback" not in message
+    assert len(message) < 4000
+    assert not re.search(r"\bobject at 0x[0-9a-f]+", message)
+
+
+def state_of(folder: Path) -> dict[str, bytes]:
+    """The files in a folder, to see that none was harmed."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.is_symlink()
+    }
+
+
+SCALARS: st.SearchStrategy[Any] = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 300),
+    st.sampled_from([2**31, 2**40, 2**63, 2**64, -(2**63), 10**30]),
+    st.floats(allow_nan=False),
+    st.text(max_size=8),
+    st.sampled_from(
+        ["../../etc/passwd", "/dev/zero", "~nosuchuser/x", "x" * 300, "\x00", "<script>", "\udcff", "1e999"]
+    ),
+)
+
+JSON = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@st.composite
+def changed_json(draw: st.DrawFn, value: Any) -> Any:
+    """A JSON value with one to three of its parts replaced, removed, doubled or given another type."""
+    value = json.loads(json.dumps(value))
+    for _ in range(draw(st.integers(1, 3))):
+        places = list(_places(value))
+        if not places:
+            return draw(JSON)
+        holder, key = draw(st.sampled_from(places))
+        kind = draw(st.sampled_from(["replace", "remove", "nest", "add", "null"]))
+        if kind == "remove":
+            del holder[key]
+        elif kind == "nest":
+            holder[key] = [holder[key]]
+        elif kind == "add" and isinstance(holder, dict):
+            holder[draw(st.text(max_size=6))] = draw(JSON)
+        else:
+            holder[key] = None if kind == "null" else draw(JSON)
+    return value
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        yield value, key
+        yield from _places(item)
+
+
+@st.composite
+def damaged(draw: st.DrawFn, data: bytes) -> bytes:
+    """Bytes with some flipped, cut, doubled, inserted or replaced."""
+    changed = bytearray(data)
+    for _ in range(draw(st.integers(1, 4))):
+        if not changed:
+            break
+        # Headers are where most is decided.
+        end = draw(st.sampled_from([min(len(changed), 128), len(changed)]))
+        place = draw(st.integers(0, end - 1))
+        kind = draw(st.sampled_from(["flip", "set", "cut", "insert", "double", "long"]))
+        if kind == "flip":
+            changed[place] ^= 1 << draw(st.integers(0, 7))
+        elif kind == "set":
+            changed[place] = draw(st.sampled_from([0, 1, 0x7F, 0x80, 0xFF]))
+        elif kind == "cut":
+            del changed[place:]
+        elif kind == "insert":
+            changed[place:place] = draw(st.binary(max_size=9))
+        elif kind == "double":
+            changed[place:place] = changed[place : place + 32]
+        else:
+            changed[place : place + 4] = b"\xff\xff\xff\x7f"
+    return bytes(changed)

@@ -1,0 +1,94 @@
+"""A stream goes on only with the frames that it came from; and it warns of what a batch run warns of."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stream_samples import stream, stream_config
+
+from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
+from uni4d_fg.pipeline.stream import stream_sequence
+from uni4d_fg.pipeline.warnings import scene_warnings
+
+FRAMES, TAKEN = 10, 6
+CONFIG = stream_config("incremental.window=4", "incremental.nonrigid_lag=2", "incremental.nonrigid_window=5")
+
+
+def scene() -> Sequence:
+    return stream(FRAMES, grid_columns=12, grid_rows=9)
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("interrupted")
+    polls = iter(range(FRAMES))
+    with pytest.raises(Cancelled):
+        stream_sequence(scene(), folder, CONFIG, should_stop=lambda: next(polls) == TAKEN)
+    return folder
+
+
+def changed(source: Any, frame: int, change: Any) -> ArrayFrames:
+    array = np.stack(list(source))
+    array[frame] = change(array[frame])
+    return ArrayFrames(array)
+
+
+def others() -> dict[str, Sequence]:
+    own = scene()
+    assert own.tracks is not None
+    replace = dataclasses.replace
+    moved = replace(own.tracks, uv=own.tracks.uv + np.float32(0.01))
+    return {
+        "another scene": stream(FRAMES, seed=99, grid_columns=12, grid_rows=9),
+        "another image": replace(own, images=changed(own.images, 1, lambda a: a ^ 1)),
+        "another depth": replace(own, depths=changed(own.depths, 0, lambda a: a * np.float32(1.0001))),
+        "another mask": replace(own, masks=changed(own.masks, TAKEN - 1, lambda a: a + 1)),
+        "another stride": replace(own, timestamps=2.0 * own.timestamps),
+        "another end": replace(
+            own, images=ArrayFrames(np.stack(list(own.images))[:8]), depths=ArrayFrames(np.stack(list(own.depths))[:8]),
+            masks=ArrayFrames(np.stack(list(own.masks))[:8]), timestamps=own.timestamps[:8], tracks=None,
+        ),
+        "online tracks": replace(own, tracks=None),
+        "other tracks": replace(own, tracks=moved),
+        "another calibration": replace(own, intrinsics=own.intrinsics * 1.01),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(others()))
+def test_a_stream_of_anything_else_does_not_go_on(interrupted: Path, name: str) -> None:
+    before = {path: path.read_bytes() for path in sorted(interrupted.rglob("*")) if path.is_file()}
+    with pytest.raises(InputError, match=r"stream\.npz.*start anew with --overwrite"):
+        stream_sequence(others()[name], interrupted, CONFIG, resume=True)
+    assert {path: path.read_bytes() for path in sorted(interrupted.rglob("*")) if path.is_file()} == before
+
+
+def test_what_is_not_reached_yet_may_be_repaired(interrupted: Path, tmp_path: Path) -> None:
+    import shutil
+
+    folder = Path(shutil.copytree(interrupted, tmp_path / "run"))
+    own = scene()
+    repaired = dataclasses.replace(own, images=changed(own.images, TAKEN + 1, lambda a: a ^ 1))
+    assert stream_sequence(repaired, folder, CONFIG, resume=True).resumed_from == TAKEN
+
+
+def test_a_stream_warns_of_what_a_batch_run_warns_of() -> None:
+    given, poses = np.array([160.0, 160.0, 80.0, 60.0]), np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [0.0, 0.5, 1.0]
+    points = np.array([[0.0, 0.0, 5.0]])
+    assert scene_warnings(given, given, poses, points) == []
+    assert "moved by 159 %" in scene_warnings(given, given * [415 / 160, 1, 1, 1], poses, points)[0]
+    assert "no landmarks" in scene_warnings(given, given, poses, np.zeros((0, 3)))[0]
+    assert "moves by only 0.00 %" in scene_warnings(given, given, np.tile(np.eye(4), (3, 1, 1)), points)[0]
+
+
+def test_a_stream_without_static_tracks_says_so(tmp_path: Path) -> None:
+    own = scene()
+    moving = dataclasses.replace(own, masks=ArrayFrames(np.ones((FRAMES, *own.image_size), np.int32)))
+    summary = stream_sequence(moving, tmp_path, CONFIG)
+    assert any("no landmarks" in text for text in summary.warnings())
+    assert any("no landmarks" in text for text in summary.to_dict()["warnings"])

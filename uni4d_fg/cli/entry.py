@@ -1,0 +1,33 @@
+"""Where the process starts: before the second that loading the program takes, Ctrl-C is made to end it quietly."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from types import FrameType
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    """End the process without a traceback; contexts that are open remove what is half-written."""
+    os.write(2, b"\nstopped: aborted before anything was begun\n")
+    sys.exit(130)
+
+
+def main() -> None:
+    """Load the command line and run it; verbs that do more than a moment's work take Ctrl-C over."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started this process
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open until the end
+        with_escapes = getattr(getattr(sys, name), "reconfigure", None)
+        if with_escapes is not None:
+            with_escapes(errors="backslashreplace")
+    from uni4d_fg.cli.main import main as run
+
+    run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""What the arrays of one frame must be, whoever hands them over: files are read into this form, callers may not be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array
+from uni4d_fg.errors import InputError
+
+_MAX_ID = np.iinfo(np.int32).max
+
+
+def checked_image(image: Any, size: tuple[int, int], where: str, *, grey: bool = False) -> ImageArray:
+    """Return an image as an array.
+
+    Args:
+        image: (H, W, 3) uint8 RGB; with ``grey`` also (H, W).
+        size: (height, width) that it must have, px.
+        where: What to call it in messages.
+        grey: Whether one channel will do.
+
+    Raises:
+        InputError: If it is not of that form.
+    """
+    array = _array(image, where)
+    shapes = [(*size, 3), size] if grey else [(*size, 3)]
+    if array.shape not in shapes:
+        expected = " or ".join(map(str, shapes))
+        raise InputError(f"{where} has shape {array.shape}, but {expected} is expected; the video is {size}")
+    if array.dtype != np.uint8:
+        raise InputError(f"{where} has dtype {array.dtype}, expected uint8; scale it to 0 to 255")
+    return array
+
+
+def checked_depth(depth: Any, size: tuple[int, int], where: str) -> Float32Array:
+    """Return a depth map in metres as a new array of float32 in which all that is not positive and finite is NaN.
+
+    Raises:
+        InputError: If it is not (H, W) numbers.
+    """
+    array = _of_size(depth, size, where)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{where} has dtype {array.dtype}; give metres as floats")
+    with np.errstate(over="ignore", invalid="ignore"):
+        cleaned: Float32Array = array.astype(np.float32)
+        cleaned[~((cleaned > 0) & np.isfinite(cleaned))] = np.nan
+    return cleaned
+
+
+def floating_depth(depth: Any, size: tuple[int, int], where: str) -> npt.NDArray[Any]:
+    """Return a depth map as it is. Raises InputError if it is not (H, W) floats: whole numbers have no unit."""
+    array = _of_size(depth, size, where)
+    if array.dtype.kind != "f":
+        raise InputError(f"{where} has dtype {array.dtype}; give metres as floats")
+    return array
+
+
+def checked_mask(mask: Any, size: tuple[int, int], where: str) -> Int32Array:
+    """Return a label map as int32; 0 is static.
+
+    Raises:
+        InputError: If it is not (H, W) whole numbers from 0 to 2**31 - 1.
+    """
+    array = _of_size(mask, size, where)
+    if array.dtype.kind not in "biu":
+        raise InputError(f"{where} has dtype {array.dtype}; give whole numbers, 0 for what is static")
+    if array.dtype != np.int32 and array.size and int(array.max()) > _MAX_ID:
+        raise InputError(f"{where} has an id of {int(array.max())}; use ids from 0 to {_MAX_ID}")
+    if array.dtype.kind == "i" and array.size and int(array.min()) < 0:
+        raise InputError(f"{where} has an id of {int(array.min())}; use ids from 0 to {_MAX_ID}")
+    return np.asarray(array, dtype=np.int32)
+
+
+def _of_size(value: Any, size: tuple[int, int], where: str) -> npt.NDArray[Any]:
+    array = _array(value, where)
+    if array.shape != tuple(size):
+        raise InputError(f"{where} has shape {array.shape}, the video is {size}; bring all to one size")
+    return array
+
+
+def _array(value: Any, where: str) -> npt.NDArray[Any]:
+    try:
+        array: npt.NDArray[Any] = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{where} is a {type(value).__name__} and no array of numbers; give a NumPy array") from error
+    return array
