@@ -3,7 +3,7 @@
     python benchmarks/ablation.py [--seeds 3]
 
 Runs the pipeline once per seed and preset, then repeats the non-rigid stage with one term switched off at a
-time. Prints a Markdown table of means over the seeds. Point errors are RMSE in metres over the observed
+time. Prints a Markdown table of means over the seeds. Point errors are RMSE in meters over the observed
 points, after the Sim(3) alignment of the cameras; the first row is the raw depth cue lifted with the
 estimated cameras, where every run starts.
 """
@@ -37,7 +37,7 @@ VARIANTS: dict[str, tuple[str, list[str]]] = {
     "without ARAP": ("default", ["nonrigid.arap_weight=0"]),
     "without smoothness": ("default", ["nonrigid.smoothness_weight=0"]),
     "without the depth prior": ("default", ["nonrigid.depth_prior=false"]),
-    "one depth scale per frame": ("default", ["nonrigid.local_scale_neighbours=0"]),
+    "one depth scale per frame": ("default", ["nonrigid.local_scale_neighbors=0"]),
     "`paper`": ("paper", []),
 }
 COLUMNS = ("ATE, m", "points, m", "hidden points, m", "AbsRel moving", "AbsRel static")

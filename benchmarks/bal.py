@@ -4,7 +4,7 @@ A file of that format (plain text, .bz2 or .gz) has one camera model per image,
 
     P = R X + t,   p = -(P_x, P_y) / P_z,   uv = f (1 + k1 |p|^2 + k2 |p|^4) p,
 
-with a Rodrigues vector for R, the camera looking along -z, y up, and pixels from the centre of the image. Ours is one
+with a Rodrigues vector for R, the camera looking along -z, y up, and pixels from the center of the image. Ours is one
 pinhole camera without distortion for all images, so that a file becomes
 
 - poses ``world_T_cam`` with OpenCV's axes (x right, y down, z forward);

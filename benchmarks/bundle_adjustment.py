@@ -27,10 +27,10 @@ end in different minima the table marks it with (!).
 With --plot the times are drawn as well. Peak memory is that of the process while it solves, the problem included; 'of
 which solver' is what is added to it from the start of the solve.
 
-Pixels are coordinates alone, so that no solver's convention for the centre of a pixel enters. An iteration is a
-linearisation; rejected steps count to the time of the iteration they precede.
+Pixels are coordinates alone, so that no solver's convention for the center of a pixel enters. An iteration is a
+linearization; rejected steps count to the time of the iteration they precede.
 
-With --roofline the C++ solver's passes are timed on one thread against what bounds them: linearisation against the
+With --roofline the C++ solver's passes are timed on one thread against what bounds them: linearization against the
 bandwidth of a plain copy (it reads 64 bytes of sorted observation and 5 of indices and writes a coupling block of
 192, which the processor reads first: 453 bytes), elimination against multiplications (3 x 7 x 7 x 2 operations per
 pair of observations of a landmark). Times are the processor's, so that other work on the machine disturbs little.
@@ -300,7 +300,7 @@ def roofline(size: int | Path) -> None:
     print(f"\n{count} observations, one thread, copy {bandwidth / 1e9:.1f} GB/s")
     print(f"energies    {energies / count * 1e9:6.1f} ns per observation")
     print(
-        f"linearise   {linearize / count * 1e9:6.1f} ns per observation; memory alone allows "
+        f"linearize   {linearize / count * 1e9:6.1f} ns per observation; memory alone allows "
         f"{453 / bandwidth * 1e9:.1f} ns (with the read before the write counted by the copy too: "
         f"{453 / (1.5 * bandwidth) * 1e9:.1f} ns)"
     )
@@ -321,7 +321,7 @@ def table(results: dict[str, dict[str, Any]]) -> None:
         f"{any_result['frames']} frames; cost {lowest:.6g}\n"
     )
     print(
-        "| solver | total, s | ratio | s / iteration | ratio | iterations | set up | linearise | solve | evaluate |",
+        "| solver | total, s | ratio | s / iteration | ratio | iterations | set up | linearize | solve | evaluate |",
         end="",
     )
     print(" peak memory, MB | of which solver | cost above lowest |\n|---|" + "---|" * 12)

@@ -3,7 +3,7 @@
     python benchmarks/camera_init.py [--frames 50] [--gtsam-frames 4] [--presets default paper] [--repeats 3]
                                      [--threads 2] [--solvers cpp python gtsam] [--plot FILE.png]
 
-Camera initialisation of the synthetic scene (320 x 240, given tracks, default noise), all windows one after the other
+Camera initialization of the synthetic scene (320 x 240, given tracks, default noise), all windows one after the other
 as in a run, in a process of its own for every solver, so that its peak memory is its own. All go through the same
 Levenberg-Marquardt driver and must arrive at the same final energy: the largest relative difference of a window to that
 of the first solver is printed, and the program fails if one is above 1e-6. Printed are the fastest of the repeats.
@@ -49,13 +49,13 @@ def run_here(solver: Any, preset: str, frames: int) -> None:
     sequence = make_synthetic_sequence(SyntheticSceneConfig(num_frames=frames, render_images=False))
     assert sequence.tracks is not None
     labelled = label_tracks(sequence.tracks, sequence, config.labels, config.input)
-    minimise = LevenbergMarquardtRunner(choose_backend(solver))
+    minimize = LevenbergMarquardtRunner(choose_backend(solver))
     if solver in MODULES:
         importlib.import_module(MODULES[solver])
     windows: list[SolveSummary] = []
 
     def run(stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
-        state, summary = minimise(stage, state, hooks)
+        state, summary = minimize(stage, state, hooks)
         windows.append(summary)
         return state, summary
 
@@ -136,7 +136,7 @@ def main() -> None:
             if results:
                 equal &= table(preset, frames, results)
     if arguments.plot:
-        draw_times(arguments.plot, [Times("Camera initialisation", "", seconds)])
+        draw_times(arguments.plot, [Times("Camera initialization", "", seconds)])
     if not equal:
         sys.exit("final energies differ by more than 1e-6: marked with (!)")
 

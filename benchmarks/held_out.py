@@ -4,7 +4,7 @@
     python benchmarks/held_out.py SEQ RUN [--weights 0 100 500 2000 5000 20000] [--folds 3]
 
 Bundle adjustment is repeated with several weights of E_cam's translation, each time without the static tracks that
-start in a part of the image (every third cell of a 5 x 5 grid: neighbouring tracks err alike and must not judge each
+start in a part of the image (every third cell of a 5 x 5 grid: neighboring tracks err alike and must not judge each
 other). The tracks held out are then triangulated with the cameras frozen, and the mean of their reprojection errors
 (each at most 5 px) says how well these cameras explain what they have not seen. Beside it stands ATE, where there is a
 true trajectory.

@@ -3,7 +3,7 @@
     python benchmarks/nonrigid.py [--sizes 400x50x6 1500x50x4] [--growth 25 50 100 200] [--solvers cpp python ...]
                                   [--repeats 3] [--cholesky] [--plot FILE.png]
 
-Every solver gets the same problem (tracks x frames x neighbours: two bodies that turn, drift and breathe, pixels of
+Every solver gets the same problem (tracks x frames x neighbors: two bodies that turn, drift and breathe, pixels of
 0.5 px with 2 % outliers, depth of 2 %, 10 % of the observations missing; the default energy) and the same start, in a
 process of its own so that its peak memory is its own. All run under the one Levenberg-Marquardt driver with the same
 damping, and stop when a step lowers the cost by less than 1e-4 of it. Printed are the fastest of the repeats.
@@ -15,10 +15,10 @@ damping, and stop when a step lowers the cost by less than 1e-4 of it. Printed a
     gtsam-metis  the same systems by GTSAM's elimination in METIS order; one linear solve only, and its cost is the
                  one after that step
 
-For GTSAM, 'solve' is the time inside GTSAM alone: making its factors from Python is not counted, and linearisation
+For GTSAM, 'solve' is the time inside GTSAM alone: making its factors from Python is not counted, and linearization
 and evaluation are those of 'python'.
 
-`--growth` solves 400 tracks x 6 neighbours with these numbers of frames and prints the exponent of the growth.
+`--growth` solves 400 tracks x 6 neighbors with these numbers of frames and prints the exponent of the growth.
 `--cholesky` times what conjugate gradients replace: a banded Cholesky over time, points ordered by frame. A frame of M
 tracks is a block of 3 M, second differences couple it with two others, so that the band has 6 M rows below the
 diagonal: (3 M T) (6 M)^2 = 108 M^3 T flop for T frames. `--plot` draws the times of the sizes and of the growth.
@@ -58,7 +58,7 @@ SOLVER = SolverConfig(max_iterations=30, relative_decrease=1e-4)
 K = np.array([300.0, 300.0, 160.0, 120.0])
 
 
-def make_problem(tracks: int, frames: int, neighbours: int, seed: int = 0) -> tuple[Problem, State]:
+def make_problem(tracks: int, frames: int, neighbors: int, seed: int = 0) -> tuple[Problem, State]:
     """Return stage 3 of two moving bodies, all points free."""
     rng = np.random.default_rng(seed)
     t, zero = np.arange(frames), np.zeros(frames)
@@ -82,14 +82,14 @@ def make_problem(tracks: int, frames: int, neighbours: int, seed: int = 0) -> tu
     depth = x[..., 2] * np.exp(rng.normal(scale=0.02, size=(tracks, frames)))
     k, f = np.nonzero(rng.random((tracks, frames)) >= 0.1)
     seen = Observations(k, f, uv[k, f], depth[k, f], np.ones(len(k)))
-    config = NonRigidConfig(neighbours=neighbours)
+    config = NonRigidConfig(neighbors=neighbors)
     cameras = Cameras(poses, K, np.zeros(frames))
     mesh, seen, rows, state = build_mesh(seen, instance, frames, cameras, config, {})
     return nonrigid_problem(state, mesh, seen, rows, cameras, StaticNoise(0.5, 0.02), config), state
 
 
 class GtsamSystems(TrajectoryObjective):
-    """NumPy's linearisation with GTSAM's linear solvers."""
+    """NumPy's linearization with GTSAM's linear solvers."""
 
     def __init__(self, problem: Problem, state: State, config: SolverConfig, method: str):
         super().__init__(problem, state, config)
@@ -182,7 +182,7 @@ def solve(solver: str, problem: Problem, state: State) -> dict[str, Any]:
     _, summary = minimize(objective, state, config)
     seconds = {"set up": planned, **{phase: summary.seconds[phase] for phase in ("linearize", "solve", "evaluate")}}
     if solver.startswith("gtsam"):
-        # Linearisation and evaluation stand beside GTSAM's solver as they are with NumPy.
+        # Linearization and evaluation stand beside GTSAM's solver as they are with NumPy.
         seconds = {**seconds, "set up": 0.0, "solve": objective.seconds, "linearize": objective.linearize_seconds}
     return {
         "cost": summary.final_energy,
@@ -233,7 +233,7 @@ def table(size: str, solvers: list[str], repeats: int) -> dict[str, float]:
 def growth(frames: list[int], solvers: list[str], repeats: int) -> dict[str, dict[int, float]]:
     """Print the time by frames, and the exponent of a power law fitted to it; return the times."""
     seconds: dict[str, dict[int, float]] = {}
-    print("\n### 400 tracks x 6 neighbours, by frames: total, s\n")
+    print("\n### 400 tracks x 6 neighbors, by frames: total, s\n")
     print("| solver | " + " | ".join(map(str, frames)) + " | exponent |")
     print("|---" * (len(frames) + 2) + "|")
     for solver in solvers:
@@ -249,7 +249,7 @@ def growth(frames: list[int], solvers: list[str], repeats: int) -> dict[str, dic
 
 def cholesky(sizes: list[str]) -> None:
     """Time one banded Cholesky of the normal equations with points ordered by frame."""
-    print("\n### Banded Cholesky over time, one factorisation\n")
+    print("\n### Banded Cholesky over time, one factorization\n")
     print("| size | rows | band | s | GFlop/s | 400x50 at that rate, s |\n|---|---|---|---|---|---|")
     for size in sizes:
         problem, state = make_problem(*map(int, size.split("x")))
@@ -299,8 +299,8 @@ def main() -> None:
     if arguments.cholesky:
         cholesky(["50x50x6", "100x50x6", "200x50x6"])
     if arguments.plot:
-        panels = [Times("Moving points", "tracks x frames x neighbours", by_size)]
-        panels.append(Times("400 tracks x 6 neighbours", "frames", by_frames))
+        panels = [Times("Moving points", "tracks x frames x neighbors", by_size)]
+        panels.append(Times("400 tracks x 6 neighbors", "frames", by_frames))
         draw_times(arguments.plot, panels)
 
 

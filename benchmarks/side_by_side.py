@@ -18,7 +18,7 @@ from uni4d_fg.errors import Uni4dFgError
 from uni4d_fg.pipeline.compare.memory import PeakMemory
 from uni4d_fg.results.pictures.figure import GRID, INK, MUTED, new_figure, save_figure
 
-COLOURS = ("#0b6e4f", "#c8553d", "#3d5a98", "#b58900", "#7b4fa3")
+COLORS = ("#0b6e4f", "#c8553d", "#3d5a98", "#b58900", "#7b4fa3")
 EQUAL = 1e-6
 """Two final energies this close, relatively, are equal."""
 
@@ -111,9 +111,9 @@ def draw_times(path: Path, panels: list[Times]) -> None:
 
 
 def _draw_lines(panel: Axes, times: Times) -> None:
-    for colour, (solver, by_size) in zip(COLOURS * 9, times.seconds.items(), strict=False):
+    for color, (solver, by_size) in zip(COLORS * 9, times.seconds.items(), strict=False):
         sizes = sorted(by_size)
-        panel.plot(sizes, [by_size[size] for size in sizes], "o-", color=colour, linewidth=1.8, label=solver)
+        panel.plot(sizes, [by_size[size] for size in sizes], "o-", color=color, linewidth=1.8, label=solver)
     panel.set_xscale("log")
     measured = sorted({size for by_size in times.seconds.values() for size in by_size})
     panel.set_xticks(measured, [f"{size:,}" for size in measured])
@@ -124,7 +124,7 @@ def _draw_bars(panel: Axes, times: Times, sizes: list[Any]) -> None:
     width = 0.8 / len(times.seconds)
     for index, (solver, by_size) in enumerate(times.seconds.items()):
         place = np.array([sizes.index(size) for size in by_size]) + (index + 0.5) * width - 0.4
-        bars = panel.bar(place, list(by_size.values()), 0.9 * width, color=(COLOURS * 9)[index], label=solver)
+        bars = panel.bar(place, list(by_size.values()), 0.9 * width, color=(COLORS * 9)[index], label=solver)
         panel.bar_label(bars, fmt="%.2g", fontsize=7, color=MUTED)
     panel.set_xticks(range(len(sizes)), [str(size) for size in sizes])
     shortest = min(seconds for by_size in times.seconds.values() for seconds in by_size.values())

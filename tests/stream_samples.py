@@ -71,7 +71,7 @@ def feed(
 
 
 def aligned_error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Distances (T,) of camera centres after Sim(3) alignment, m."""
+    """Distances (T,) of camera centers after Sim(3) alignment, m."""
     a, b = found[:, :3, 3], truth[:, :3, 3]
     da, db = a - a.mean(axis=0), b - b.mean(axis=0)
     u, s, vt = np.linalg.svd(db.T @ da)

@@ -32,7 +32,7 @@ class DegenerateProblemError(Uni4dFgError):
 
 
 class SolverError(Uni4dFgError):
-    """The optimiser cannot continue: a non-finite residual, a wrong shape, a singular system."""
+    """The optimizer cannot continue: a non-finite residual, a wrong shape, a singular system."""
 
     exit_code = 5
 

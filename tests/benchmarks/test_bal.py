@@ -80,9 +80,9 @@ def test_poses_are_those_of_the_file_up_to_scale(bal: Any, tmp_path: Path) -> No
     problem = bal.read_bal(path)
     scale = np.linalg.norm(problem.points) / np.linalg.norm(points)
     rotation = Rotation.from_rotvec(cameras[:, :3])
-    centres = -rotation.inv().apply(cameras[:, 3:6])
+    centers = -rotation.inv().apply(cameras[:, 3:6])
     np.testing.assert_allclose(problem.points, scale * points, atol=1e-12)
-    np.testing.assert_allclose(problem.world_T_cam[:, :3, 3], scale * centres, atol=1e-10)
+    np.testing.assert_allclose(problem.world_T_cam[:, :3, 3], scale * centers, atol=1e-10)
     np.testing.assert_allclose(problem.world_T_cam[:, :3, 2], rotation.inv().apply([0, 0, -1]), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(problem.world_T_cam), 1.0)
     depth = world_to_camera(problem.world_T_cam[problem.camera], problem.points[problem.point])[:, 2]

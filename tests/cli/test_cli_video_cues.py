@@ -67,7 +67,7 @@ def card(tmp_path: Path) -> Path:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     onnx.save(model, str(tmp_path / "tiny.onnx"))
     values = {
-        "kind": "depth", "title": "tiny", "file": "tiny.onnx", "licence": "none", "export": "made by a test",
+        "kind": "depth", "title": "tiny", "file": "tiny.onnx", "license": "none", "export": "made by a test",
         "input": {"name": "image"}, "depth": {"name": "depth", "kind": "metric_depth"},
     }  # fmt: skip
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(values))

@@ -43,7 +43,7 @@ def test_the_paper_preset_has_the_numbers_of_the_reference_program() -> None:
         assert (motion.rotation_weight, motion.translation_weight) == (1.0, 1.0)
     assert not config.bundle_adjustment.depth_prior
     assert not config.nonrigid.depth_prior
-    assert (config.nonrigid.neighbours, config.nonrigid.smoothness_order) == (4, 1)
+    assert (config.nonrigid.neighbors, config.nonrigid.smoothness_order) == (4, 1)
     assert (config.nonrigid.smoothness_weight, config.nonrigid.arap_weight) == (10.0, 100.0)
     assert config.nonrigid.annealing[-1] == 1.0
     assert config.labels.min_static_fraction == 0.2
@@ -79,9 +79,9 @@ def test_a_section_keeps_what_its_parent_gave_it(tmp_path: Path) -> None:
 
 
 def test_a_file_names_its_preset_and_overrides_come_last(tmp_path: Path) -> None:
-    path = write(tmp_path / "mine.yaml", "preset: paper\nnonrigid:\n  neighbours: 5\n  arap_weight: 50.0\n")
-    config = load_config(path, ["nonrigid.neighbours=6"])
-    assert (config.nonrigid.neighbours, config.nonrigid.arap_weight, config.energy) == (6, 50.0, "paper")
+    path = write(tmp_path / "mine.yaml", "preset: paper\nnonrigid:\n  neighbors: 5\n  arap_weight: 50.0\n")
+    config = load_config(path, ["nonrigid.neighbors=6"])
+    assert (config.nonrigid.neighbors, config.nonrigid.arap_weight, config.energy) == (6, 50.0, "paper")
 
 
 def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_override_values_are_yaml(override: str, expected: object) -> None:
 def test_an_override_can_give_a_whole_section() -> None:
     config = load_config(None, ["nonrigid={arap_weight: 3, solver: {max_iterations: 4}}"])
     assert config.nonrigid.solver.max_iterations == 4
-    assert config.nonrigid.neighbours == Config().nonrigid.neighbours
+    assert config.nonrigid.neighbors == Config().nonrigid.neighbors
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_an_override_can_give_a_whole_section() -> None:
         ("nonrigid.depth_sigma=.nan", ["nonrigid.depth_sigma: got nan", "finite"]),
         ("input.max_depth_m=.inf", ["input.max_depth_m: got inf", "finite"]),
         ("camera_init.window=2024-01-01", ["camera_init.window: got"]),
-        ("fusion=4", ["fusion: got 4", "a section with the fields", "neighbours"]),
+        ("fusion=4", ["fusion: got 4", "a section with the fields", "neighbors"]),
         ("energy", ["--set energy", "section.field=VALUE"]),
         ("=3", ["section.field=VALUE"]),
         ("energy=[", ["--set energy", "not a YAML value"]),
@@ -159,8 +159,8 @@ def test_a_wrong_override_says_where_what_and_what_is_allowed(override: str, par
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ("nonrigd:\n  neighbours: 3\n", ["nonrigd: unknown field", "nonrigid?"]),
-        ("nonrigid:\n  neighbours: -3\n", ["nonrigid.neighbours: got -3"]),
+        ("nonrigd:\n  neighbors: 3\n", ["nonrigd: unknown field", "nonrigid?"]),
+        ("nonrigid:\n  neighbors: -3\n", ["nonrigid.neighbors: got -3"]),
         ("- 1\n- 2\n", ["holds list", "mapping"]),
         ("a: [1\n", ["not valid YAML", "line 2"]),
         ("energy: map\nenergy: map\n", ["line 2", "given twice"]),

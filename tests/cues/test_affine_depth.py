@@ -68,7 +68,7 @@ def test_outliers_and_noise_are_borne(rng: np.random.Generator) -> None:
     assert found.sigma == pytest.approx(0.02, rel=0.7)
 
 
-def test_a_frame_without_points_follows_its_neighbours() -> None:
+def test_a_frame_without_points_follows_its_neighbors() -> None:
     case = Case(1, np.full(FRAMES, 0.02), np.full(FRAMES, 0.05))
     case.sparse[:, 3] = np.nan
     case.sparse[:3, 3] = 0.01  # three wild points are no say
@@ -78,7 +78,7 @@ def test_a_frame_without_points_follows_its_neighbours() -> None:
     assert found.points[3] == 0
     assert found.warnings == (
         "relative depth of 1 frame(s) has too few points (or contradicts them) and takes scale and shift from its "
-        "neighbours: 3",
+        "neighbors: 3",
     )
 
 

@@ -37,7 +37,7 @@ def network(
     return DepthNetwork(find_model(str(write_card(tmp_path / "tiny.yaml", **card)), "depth"), CPU)
 
 
-def test_metric_depth_is_what_the_network_says_of_normalised_channels(tmp_path: Path) -> None:
+def test_metric_depth_is_what_the_network_says_of_normalized_channels(tmp_path: Path) -> None:
     image = ramp()
     spec = {"mean": [0.1, 0.2, 0.3], "std": [0.5, 0.25, 1.0]}
     found = network(tmp_path, (1.0, 2.0, 3.0), 5.0, input=spec).estimate(image, 50.0)
@@ -46,7 +46,7 @@ def test_metric_depth_is_what_the_network_says_of_normalised_channels(tmp_path: 
     assert found.intrinsics is None
 
 
-def test_colours_can_be_the_other_way_round_and_unscaled(tmp_path: Path) -> None:
+def test_colors_can_be_the_other_way_round_and_unscaled(tmp_path: Path) -> None:
     image = ramp()
     found = network(tmp_path, (1.0, 0, 0), input={"color": "bgr", "scale": 1.0}).estimate(image, 50.0)
     np.testing.assert_allclose(found.values, image[..., 2], rtol=1e-6)
@@ -69,7 +69,7 @@ def test_depth_comes_back_to_the_pixels_of_the_image(tmp_path: Path, size: dict[
     assert found.values.shape == (48, 64)
     inside = np.s_[4:-4, 4:-4]
     expected = image[..., 0] / 25.5
-    # Half a pixel of misplacement would be 0.039; rounding to grey levels is 0.02.
+    # Half a pixel of misplacement would be 0.039; rounding to gray levels is 0.02.
     np.testing.assert_allclose(found.values[inside], expected[inside], atol=0.03)
 
 
@@ -118,7 +118,7 @@ def test_what_is_unsure_far_or_near_is_missing(tmp_path: Path) -> None:
 
 
 def test_a_point_map_gives_its_last_channel_and_a_camera(tmp_path: Path) -> None:
-    # As UniDepth: points and a camera at the network's size, pixel centres at 0.5.
+    # As UniDepth: points and a camera at the network's size, pixel centers at 0.5.
     points = np.random.default_rng(0).uniform(1, 2, (1, 3, 32, 48)).astype(np.float32)
     camera = np.array([[[60.0, 0, 24.0], [0, 66.0, 16.0], [0, 0, 1]]], np.float32)
     constant_network(tmp_path / "tiny.onnx", {"pts_3d": points, "intrinsics": camera}, (32, 48))
@@ -126,7 +126,7 @@ def test_a_point_map_gives_its_last_channel_and_a_camera(tmp_path: Path) -> None
         tmp_path / "tiny.yaml",
         size={"rule": "fixed", "height": 32, "width": 48},
         depth={"name": "pts_3d", "channel": 2},
-        intrinsics={"name": "intrinsics", "kind": "matrix", "pixel_centre": 0.5},
+        intrinsics={"name": "intrinsics", "kind": "matrix", "pixel_center": 0.5},
     )
     model = DepthNetwork(find_model(str(card), "depth"), CPU)
     found = model.estimate(np.zeros((64, 96, 3), np.uint8), 1.0)

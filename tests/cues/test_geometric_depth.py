@@ -199,7 +199,7 @@ def test_a_plane_is_interpolated_exactly_within_the_hull(rng: np.random.Generato
     dense = interpolate(SparseInverseDepth(uv, plane(uv)), (100, 100), 4)
     rows, columns = np.indices((100, 100))
     exact = plane(np.stack([columns.ravel(), rows.ravel()], axis=1)).reshape(100, 100)
-    # Beyond the outermost grid centres cv2.resize repeats the border.
+    # Beyond the outermost grid centers cv2.resize repeats the border.
     np.testing.assert_allclose(dense[2:-2, 2:-2], exact[2:-2, 2:-2], rtol=1e-4)
 
 

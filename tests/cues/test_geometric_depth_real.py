@@ -29,14 +29,14 @@ def test_kitchen_from_frames_alone(data_root: Path) -> None:
     guess = np.array([320.0, 320.0, 159.5, 119.5])
     found = depth_from_motion(video, tracks, np.ones(tracks.num_tracks, dtype=bool), guess, config)
     assert found.has_parallax
-    # The colour camera's is about 525 px at full size.
+    # The color camera's is about 525 px at full size.
     np.testing.assert_allclose(found.intrinsics[:2], 262.5, rtol=0.1)
     truth = np.load(data_root / "kitchen" / "c2w.npy")[::STRIDE]
     metrics = evaluate_trajectory(found.world_T_cam, truth)
     assert metrics.ate_m < 0.010
     assert metrics.rpe_rotation_deg is not None
     assert metrics.rpe_rotation_deg < 0.25
-    # Depth against the sensor, which is not registered to the colour camera, after one scale.
+    # Depth against the sensor, which is not registered to the color camera, after one scale.
     depth = np.stack(list(found.depths))
     maps = sorted((data_root / "kitchen" / "depth_gt").iterdir())[::STRIDE]
     sensor = np.stack([cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[::2, ::2] for path in maps]) / 1000.0

@@ -105,7 +105,7 @@ def test_a_missed_thing_is_drawn_where_it_would_be() -> None:
 
 
 def test_a_fast_pan_is_followed_by_flow_and_not_by_overlap_alone() -> None:
-    # Things of 12 px, 15 px apart, move by 10 px per frame: each overlaps most with the place of its neighbour.
+    # Things of 12 px, 15 px apart, move by 10 px per frame: each overlaps most with the place of its neighbor.
     scene = Scene({n: [(30, 100 + 15 * (n - 1) - 10 * t) for t in range(5)] for n in (1, 2)}, side=12)
     canvas = texture(0, (SIZE[0], SIZE[1] + 64))
     for n in (1, 2):

@@ -24,7 +24,7 @@ VELOCITY = (0.5, -0.25)
 
 
 def video(num_frames: int, height: int = 48, width: int = 80) -> ArrayFrames:
-    """Every frame is of one grey level, its number."""
+    """Every frame is of one gray level, its number."""
     levels = np.arange(num_frames, dtype=np.uint8)
     return ArrayFrames(np.broadcast_to(levels[:, None, None, None], (num_frames, height, width, 3)))
 
@@ -75,7 +75,7 @@ def test_tracks_cover_a_short_video_from_every_query(tmp_path: Path) -> None:
 
 
 def test_windows_hand_tracks_on_in_both_directions(tmp_path: Path) -> None:
-    num_frames = 19  # up to the grey level at which points hide
+    num_frames = 19  # up to the gray level at which points hide
     tracks = tracker(tmp_path).track(video(num_frames))
     check_positions(tracks, num_frames)
     for query in (0, 6, 12, 18):
@@ -96,9 +96,9 @@ def test_a_short_hiding_is_bridged_and_a_long_one_ends_the_track(tmp_path: Path)
     assert narrow.visible[narrow.query_frame == 12][:, 24:].sum() < early[:, 24:].sum()
 
 
-@pytest.mark.parametrize("centre", [0.0, 0.5])
-def test_the_pixel_centre_of_the_network_cancels_out(tmp_path: Path, centre: float) -> None:
-    tracks = tracker(tmp_path, video={"pixel_centre": centre}).track(video(7))
+@pytest.mark.parametrize("center", [0.0, 0.5])
+def test_the_pixel_center_of_the_network_cancels_out(tmp_path: Path, center: float) -> None:
+    tracks = tracker(tmp_path, video={"pixel_center": center}).track(video(7))
     check_positions(tracks, 7)
     grid = tracks.uv[tracks.query_frame == 0, 0]
     np.testing.assert_allclose(grid[0], [6.0, 6.0])

@@ -68,7 +68,7 @@ CLASSES = ["person", "chair", "dog"]
 
 
 def yolo(tmp_path: Path, rows: list[list[float]], **card: Any) -> SegmentationNetwork:
-    """Candidates: box centre x, y, width, height, three scores, two coefficients; two prototypes of 16 x 16."""
+    """Candidates: box center x, y, width, height, three scores, two coefficients; two prototypes of 16 x 16."""
     prototypes = np.full((1, 2, 16, 16), -8.0)
     prototypes[0, 0] = 8.0  # everywhere
     prototypes[0, 1, :, 8:] = 8.0  # right half

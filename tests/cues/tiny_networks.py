@@ -68,9 +68,9 @@ def constant_network(path: Path, outputs: dict[str, Any], size: tuple[int, int])
 
 
 def moving_points(path: Path, frames: int, points: int, size: tuple[int, int], velocity: tuple[float, float]) -> Path:
-    """Tracks that move by ``velocity`` px per grey level, so that the brightness of a frame tells where they are.
+    """Tracks that move by ``velocity`` px per gray level, so that the brightness of a frame tells where they are.
 
-    Points are seen but for grey levels from 20 to 22.
+    Points are seen but for gray levels from 20 to 22.
     """
     axes = np.array([2, 3, 4])
     nodes = [
@@ -114,7 +114,7 @@ def moving_points(path: Path, frames: int, points: int, size: tuple[int, int], v
 def write_card(path: Path, **changes: Any) -> Path:
     """Write a card for depth with a few fields changed; nested fields as mappings."""
     card: dict[str, Any] = {
-        "kind": "depth", "title": "tiny", "file": "tiny.onnx", "licence": "none", "export": "made by a test",
+        "kind": "depth", "title": "tiny", "file": "tiny.onnx", "license": "none", "export": "made by a test",
         "input": {"name": "image"},
     }  # fmt: skip
     if changes.get("kind", "depth") == "depth":

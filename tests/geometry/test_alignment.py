@@ -67,7 +67,7 @@ def test_planar_points_give_a_proper_rotation() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_collinear_centres_take_the_roll_from_the_orientations(seed: int) -> None:
+def test_collinear_centers_take_the_roll_from_the_orientations(seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = random_similarity(rng)
     line = np.linspace(-1, 2, 15)[:, None] * rng.normal(size=3) + rng.normal(size=3)

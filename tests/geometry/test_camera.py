@@ -1,4 +1,4 @@
-"""The pinhole camera: round trips, parity with GTSAM's, NumPy and torch, behaviour behind the camera."""
+"""The pinhole camera: round trips, parity with GTSAM's, NumPy and torch, behavior behind the camera."""
 
 from __future__ import annotations
 

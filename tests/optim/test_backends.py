@@ -28,7 +28,7 @@ CONVERGED = [
 """Solves that end at the minimum: the backends reach it on different ways, so that early stops end elsewhere."""
 ENERGY_TOLERANCE = {"cpp": 1e-8, "gtsam": 1e-4}
 """On another way a landmark may end in another minimum of its depth kernel."""
-CENTRE_TOLERANCE_M = {"cpp": 1e-7, "gtsam": 1e-7}
+CENTER_TOLERANCE_M = {"cpp": 1e-7, "gtsam": 1e-7}
 INTRINSICS_TOLERANCE = {"cpp": 1e-7, "gtsam": 1e-7}
 
 needs_extension = pytest.mark.skipif(find_extension()[0] is None, reason=find_extension()[1] or "installed")
@@ -73,7 +73,7 @@ def test_same_reconstruction_from_every_backend(
     ours = stage_arrays(folder, "bundle_adjustment")
     theirs = stage_arrays(expected_folder, "bundle_adjustment")
     np.testing.assert_allclose(
-        ours["world_T_cam"][:, :3, 3], theirs["world_T_cam"][:, :3, 3], atol=CENTRE_TOLERANCE_M[backend]
+        ours["world_T_cam"][:, :3, 3], theirs["world_T_cam"][:, :3, 3], atol=CENTER_TOLERANCE_M[backend]
     )
     np.testing.assert_allclose(ours["intrinsics"], theirs["intrinsics"], rtol=INTRINSICS_TOLERANCE[backend])
 

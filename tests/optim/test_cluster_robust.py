@@ -152,7 +152,7 @@ def test_cells_tile_the_image() -> None:
 
 
 def test_held_landmarks_are_constants_whose_errors_a_cluster_shares() -> None:
-    """One camera before known points: about three neighbours share their error, so that it does not cancel."""
+    """One camera before known points: about three neighbors share their error, so that it does not cancel."""
     rng = np.random.default_rng(11)
     problem, truth = problem_of(rng)
     batches = []
@@ -165,7 +165,7 @@ def test_held_landmarks_are_constants_whose_errors_a_cluster_shares() -> None:
     problem = Problem(tuple(batches), {POSE: only})
     (reprojection,) = problem.batches
     landmark = next(s.rows for s in reprojection.slots if s.variable == LANDMARK)
-    # Strips of the image: what neighbours share does not cancel.
+    # Strips of the image: what neighbors share does not cancel.
     of_landmark = np.zeros(LANDMARKS, dtype=np.int64)
     of_landmark[landmark[np.argsort(reprojection.data["uv"][:, 0])]] = (
         np.arange(len(landmark)) * CLUSTERS // len(landmark)

@@ -216,7 +216,7 @@ SAMPLES: dict[str, Callable[[np.random.Generator], Sample]] = {
     "moving points": moving_points,
     "frozen landmarks": lambda rng: frozen(scene(rng), landmark=slice(0, 90, 4)),
     "frozen intrinsics": lambda rng: frozen(scene(rng), intrinsics=None),
-    "frozen centre": lambda rng: frozen(scene(rng), intrinsics=(slice(None), slice(2, 4))),
+    "frozen center": lambda rng: frozen(scene(rng), intrinsics=(slice(None), slice(2, 4))),
     "frozen entries": lambda rng: frozen(scene(rng), pose=(slice(2, 4), slice(1, 5)), log_scale=[1, 2]),
     "frozen poses": lambda rng: frozen(scene(rng), pose=None, intrinsics=None),
     "landmarks alone": lambda rng: frozen(scene(rng), pose=None, intrinsics=None, log_scale=None),

@@ -36,7 +36,7 @@ K = np.array([500.0, 505.0, 320.0, 240.0])
 
 @factor(POSE, MAP, data={"map_T_cam": (4, 4)}, dim=3, name="test_optimizer_in_map")
 def in_map(world_T_cam, map_T_world, *, map_T_cam):  # type: ignore[no-untyped-def]
-    """Centre of a camera in the axes of a map."""
+    """Center of a camera in the axes of a map."""
     found = map_T_world @ world_T_cam
     return found[..., :3, 3] - map_T_cam[..., :3, 3]
 

@@ -1,4 +1,4 @@
-"""The driver: parity with GTSAM's optimiser, descent, every named termination, guards, the summary."""
+"""The driver: parity with GTSAM's optimizer, descent, every named termination, guards, the summary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Marginalisation: nothing is lost of a linear problem; the linear prior's Jacobians; what carries nothing."""
+"""Marginalization: nothing is lost of a linear problem; the linear prior's Jacobians; what carries nothing."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_a_sliding_window_equals_the_whole_linear_problem(rng: np.random.Generat
             )
             used.append(batch.take(np.flatnonzero(touched)))
             kept.append(batch.take(np.flatnonzero(~touched)))
-        # Another linearisation point each time: a linear problem does not mind.
+        # Another linearization point each time: a linear problem does not mind.
         here = state.replace({LOG_SCALE: rng.normal(size=(length, 1)), LANDMARK: rng.normal(size=(len(first), 3))})
         leaving = {LOG_SCALE: np.arange(length) == oldest}
         prior = marginalize(tuple(used), here, all_free(state, LOG_SCALE), leaving, CONFIG)

@@ -83,7 +83,7 @@ def test_covariance_is_the_spread_of_repeated_estimates() -> None:
     """The sample variance of n normal draws has a relative deviation of sqrt(2 / (n - 1)): 0.100 for 200.
 
     A mean of squared Mahalanobis distances over n draws of d entries has the deviation sqrt(2 d / n). Both are
-    held to four deviations, over 21 variances and 5 blocks, plus 2 % for what the linearisation leaves out.
+    held to four deviations, over 21 variances and 5 blocks, plus 2 % for what the linearization leaves out.
     """
     rng = np.random.default_rng(11)
     problem, state = bundle(rng, num_poses=4, num_landmarks=40, depth=True)

@@ -38,7 +38,7 @@ def _make(items: tuple[tuple[str, Any], ...]) -> Sequence:
 
 
 def make_scene(size: dict[str, Any], **changes: Any) -> Sequence:
-    """A synthetic sequence with flat grey images; each is made once per process."""
+    """A synthetic sequence with flat gray images; each is made once per process."""
     return _make(tuple((size | changes).items()))
 
 

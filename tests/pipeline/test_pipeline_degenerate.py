@@ -79,7 +79,7 @@ def test_a_static_video_has_no_trajectories(tmp_path: Path) -> None:
 
 def test_an_all_dynamic_video_does_not_determine_the_cameras(tmp_path: Path) -> None:
     sequence = make_scene(SMALL, objects="all_dynamic")
-    assert_refused(sequence, tmp_path, "camera initialisation", "0 static", "everything marked as moving")
+    assert_refused(sequence, tmp_path, "camera initialization", "0 static", "everything marked as moving")
 
 
 def test_an_all_dynamic_video_with_known_cameras(tmp_path: Path) -> None:
@@ -344,7 +344,7 @@ def broken_parts(scene: Sequence) -> dict[str, tuple[dict[str, object], str]]:
     lost, sheared, mirrored = poses.copy(), poses.copy(), poses.copy()
     lost[3, 0, 3], sheared[5, 0, 1] = np.nan, sheared[5, 0, 1] + 1e-3
     mirrored[:, :3, 0] *= -1.0
-    grey = np.zeros((FRAMES, 90, 128, 3), np.uint8)
+    gray = np.zeros((FRAMES, 90, 128, 3), np.uint8)
     return {
         "few poses": ({"initial_world_T_cam": poses[:4]}, rf"has shape \(4, 4, 4\); give \({FRAMES}, 4, 4\)"),
         "lost pose": ({"initial_world_T_cam": lost}, r"not a rigid transform in frame\(s\) 3;"),
@@ -356,7 +356,7 @@ def broken_parts(scene: Sequence) -> dict[str, tuple[dict[str, object], str]]:
         "too few times": ({"timestamps": times[:4]}, "one strictly increasing number of seconds per frame"),
         "too few depth maps": ({"depths": ArrayFrames(depth_of(scene)[:5])}, "has 5 depth maps, but there are 8"),
         "too few masks": ({"masks": ArrayFrames(masks_of(scene)[:5])}, "has 5 masks, but there are 8 images"),
-        "small images": ({"images": ArrayFrames(grey)}, r"image of frame 0 has shape \(90, 128, 3\)"),
+        "small images": ({"images": ArrayFrames(gray)}, r"image of frame 0 has shape \(90, 128, 3\)"),
         "small depth": ({"depths": ArrayFrames(depth_of(scene)[:, :90])}, r"depth of frame 0 has shape \(90, 128\)"),
     }  # fmt: skip
 

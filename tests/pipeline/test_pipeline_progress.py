@@ -73,7 +73,7 @@ def test_every_task_begins_advances_and_ends_in_order(tmp_path: Path, sequence: 
 def test_resumed_stages_are_not_reported(tmp_path: Path, sequence: Sequence) -> None:
     run_sound(sequence, tmp_path)
     recorder = Recorder()
-    run_sound(sequence, tmp_path, make_config("nonrigid.neighbours=3"), resume=True, reporter=recorder)
+    run_sound(sequence, tmp_path, make_config("nonrigid.neighbors=3"), resume=True, reporter=recorder)
     assert [name for name, _ in tasks_of(recorder.events)] == ["nonrigid", "fusion", "clouds and pictures"]
 
 

@@ -166,7 +166,7 @@ def test_a_summary_is_there_only_after_a_complete_run(finished: Path, sequence: 
     folder = RunFolder(finished)
     assert folder.summary.exists()
     with pytest.raises(Cancelled):
-        reconstruct(sequence, finished, quick("nonrigid.neighbours=3"), resume=True, should_stop=stop_at(10))
+        reconstruct(sequence, finished, quick("nonrigid.neighbors=3"), resume=True, should_stop=stop_at(10))
     assert not folder.summary.exists()
     run_sound(sequence, finished, quick(), resume=True)
     assert folder.summary.exists()

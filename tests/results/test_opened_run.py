@@ -65,7 +65,7 @@ def test_a_sequence_that_has_changed_is_not_shown(finished_run: Path) -> None:
     assert "64x48" in result.notes[0]
 
 
-def test_lengths_are_metres_unless_the_run_says_otherwise(finished_run: Path, tmp_path: Path) -> None:
+def test_lengths_are_meters_unless_the_run_says_otherwise(finished_run: Path, tmp_path: Path) -> None:
     run = copied(finished_run, tmp_path)
     summary = json.loads((run / "summary.json").read_text())
     (run / "summary.json").write_text(json.dumps({**summary, "cues": {"metric": False}}))

@@ -101,8 +101,8 @@ def test_depth_strip(tmp_path: Path, frames: int, known: bool) -> None:
     depth[:, 6, 6] = 0.0
     draw_depth_strip(tmp_path / "depth.png", ArrayFrames(images), ArrayFrames(depth), ArrayFrames(1.05 * depth))
     picture = read(tmp_path / "depth.png")
-    grey = (np.abs(picture.astype(int) - [0xC3, 0xBD, 0xB9]).max(axis=2) <= 1).sum()
-    assert grey > 100
+    gray = (np.abs(picture.astype(int) - [0xC3, 0xBD, 0xB9]).max(axis=2) <= 1).sum()
+    assert gray > 100
 
 
 @pytest.mark.parametrize(

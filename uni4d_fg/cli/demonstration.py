@@ -82,16 +82,16 @@ def accuracy_lines(report: EvaluationReport, focal: float, focal_cue: float, foc
     if path is not None:
         length = path.path_length_reference_m
         share = f", {100 * path.ate_m / length:.2f} % of the path of {length:.2f} m" if length else ""
-        lines.append(f"camera path       ATE {_millimetres(path.ate_m)}{share}")
+        lines.append(f"camera path       ATE {_millimeters(path.ate_m)}{share}")
         rotation = "-" if path.rpe_rotation_deg is None else f"{path.rpe_rotation_deg:.3f} deg"
-        lines.append(f"                  RPE {_millimetres(path.rpe_translation_m)} and {rotation} per frame")
+        lines.append(f"                  RPE {_millimeters(path.rpe_translation_m)} and {rotation} per frame")
         lines.append(f"scale             {_error(path.scale, 1.0)} off")
     lines.append(
         f"focal length      {_error(focal_cue, focal_true)} off at the start, {_error(focal, focal_true)} at the end"
     )
     moving = _observed(report.dynamic_points)
     if moving is not None:
-        errors = f"RMSE {_millimetres(moving.rmse_m)}, median {_millimetres(moving.median_m)}"
+        errors = f"RMSE {_millimeters(moving.rmse_m)}, median {_millimeters(moving.median_m)}"
         lines.append(f"dynamic points    {errors}, over {moving.points} observed points")
     if report.depth is not None and report.depth_cue is not None:
         cue, fused = (r.metrics["metric"].regions["all"].abs_rel for r in (report.depth_cue, report.depth))
@@ -134,7 +134,7 @@ def _error(value: float, truth: float) -> str:
     return f"{100 * abs(value / truth - 1):.2f} %"
 
 
-def _millimetres(value: float | None) -> str:
+def _millimeters(value: float | None) -> str:
     return "-" if value is None else f"{1000 * value:.2f} mm"
 
 

@@ -105,7 +105,7 @@ def report_lines(found: dict[str, Any], with_export: bool = False) -> list[str]:
         state = f"ready, {card['path']}" if card["exists"] else f"{card['file']} is not there"
         lines.append(f"    {name:<24} {card['kind']:<12} {state}")
         if with_export:
-            lines += [f"        {card['title']}; {card['licence']}; {card['source']}", "        looked at:"]
+            lines += [f"        {card['title']}; {card['license']}; {card['source']}", "        looked at:"]
             lines += [f"            {place}" for place in card["looked_at"]]
             lines += [f"        {line}" for line in card["export"].rstrip().splitlines()]
     if not with_export and not all(card.get("exists", True) for card in found["cards"].values()):
@@ -136,7 +136,7 @@ def _cards() -> dict[str, Any]:
         out[name] = {
             "kind": card.kind,
             "title": card.title,
-            "licence": card.licence,
+            "license": card.license,
             "source": card.source,
             "file": card.file,
             "path": str(model.weights),

@@ -18,7 +18,7 @@ class LayoutChoice(str, Enum):
 
 
 class SolverChoice(str, Enum):
-    """Minimisers of the stages."""
+    """Minimizers of the stages."""
 
     lm = "lm"
     adam = "adam"
@@ -83,7 +83,7 @@ Start = Annotated[int, typer.Option(help="First frame.")]
 Stop = Annotated[int | None, typer.Option(help="First frame that is left out.", show_default=False)]
 Stride = Annotated[int, typer.Option(help="Take every so many frames.")]
 MaxSize = Annotated[int | None, typer.Option(help="Longer side of the images at most, px.", show_default=False)]
-DepthScale = Annotated[float, typer.Option(help="Units per metre of true depth in PNGs (Uni4D's layout).")]
+DepthScale = Annotated[float, typer.Option(help="Units per meter of true depth in PNGs (Uni4D's layout).")]
 KnownIntrinsics = Annotated[
     bool, typer.Option("--known-intrinsics", help="Take K.npy instead of the estimate (Uni4D's layout).")
 ]
@@ -94,7 +94,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="FIELD=VALUE", help="Change one field; may be repeated.", show_default=False),
 ]
-Solver = Annotated[SolverChoice | None, typer.Option(help="Minimiser; short for --set solver=...", show_default=False)]
+Solver = Annotated[SolverChoice | None, typer.Option(help="Minimizer; short for --set solver=...", show_default=False)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 WindowFrames = Annotated[
     int | None,

@@ -79,7 +79,7 @@ class SequenceInput:
             depth: Name of a cue of the sequence, or a file or folder beside it.
             masks: The same; or 'motion' or 'none'.
             tracks: The same.
-            depth_gt_scale: Units per metre of true depth in PNGs (Uni4D's layout).
+            depth_gt_scale: Units per meter of true depth in PNGs (Uni4D's layout).
             known_intrinsics: Take ``K.npy`` instead of the estimate (Uni4D's layout).
             more: The other fields.
         """

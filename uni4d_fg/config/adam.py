@@ -1,4 +1,4 @@
-"""Configuration of the Adam solver: the optimiser of Uni4D's authors, with the numbers of their program."""
+"""Configuration of the Adam solver: the optimizer of Uni4D's authors, with the numbers of their program."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class AdamScheduleConfig(Section):
     """Step sizes and stopping of one stage."""
 
     max_iterations: int = setting(2000, "Largest number of iterations.", ge=1)
-    pose_learning_rate: float = setting(1e-2, "Learning rate of rotation vectors (rad) and camera centres (m).", gt=0)
+    pose_learning_rate: float = setting(1e-2, "Learning rate of rotation vectors (rad) and camera centers (m).", gt=0)
     intrinsics_learning_rate: float = setting(1e-4, "Learning rate of the intrinsics, px.", gt=0)
     point_learning_rate: float = setting(1e-2, "Learning rate of landmarks and dynamic points, m.", gt=0)
     log_scale_learning_rate: float = setting(1e-2, "Learning rate of the frames' depth log-scales.", gt=0)
@@ -32,7 +32,7 @@ class AdamConfig(Section):
 
     camera_init: AdamScheduleConfig = setting(
         AdamScheduleConfig(max_iterations=600, pose_learning_rate=1e-3, plateau_patience=10, stop_patience=20),
-        "Every window of stage 1; each starts a new optimiser.",
+        "Every window of stage 1; each starts a new optimizer.",
     )
     bundle_adjustment: AdamScheduleConfig = setting(AdamScheduleConfig(), "Every solve of stage 2.")
     nonrigid: AdamScheduleConfig = setting(AdamScheduleConfig(max_iterations=1000, plateau_patience=10), "Stage 3.")

@@ -35,7 +35,7 @@ class TrackingConfig(Section):
         "removes drifted observations, and with them some that hold the cameras.",
         gt=0,
     )
-    max_patch_error: float = setting(12.0, "Largest mean absolute grey-level difference of the window.", gt=0)
+    max_patch_error: float = setting(12.0, "Largest mean absolute gray-level difference of the window.", gt=0)
     min_texture: float = setting(1e-4, "Smallest eigenvalue of the window's gradient matrix (OpenCV scale).", ge=0)
     border_px: float = setting(1.0, "A point closer than this to the image border is lost, px.", ge=0)
     min_observations: int = setting(3, "Tracks seen in fewer frames are not kept.", ge=1)

@@ -33,7 +33,7 @@ A configuration is built in layers, and each layer holds only what it changes:
 4. `--set section.field=VALUE` on the command line, with VALUE in YAML.
 
 ```bash
-uni4d-fg reconstruct SEQ --out RUN --config paper --set nonrigid.neighbours=8
+uni4d-fg reconstruct SEQ --out RUN --config paper --set nonrigid.neighbors=8
 uni4d-fg config --config mine.yaml        # print the configuration as it would be used; --all for every field
 ```
 

@@ -73,7 +73,7 @@ class GeometricDepthConfig(Section):
         3, "The focal lengths are free from this many posed frames on: two do not determine them robustly.", ge=2
     )
     triangulation_huber_px: float = setting(1.0, "Threshold of Huber's kernel in triangulation, px.", gt=0)
-    support_neighbours: int = setting(
+    support_neighbors: int = setting(
         8, "A point is interpolated only if it is like some of this many nearest points of the frame: ...", ge=1
     )
     min_supporters: int = setting(2, "... at least this many, ...", ge=0)
@@ -88,7 +88,7 @@ class AffineDepthConfig(Section):
 
     kernel_threshold: float = setting(2.0, "Residuals above this many measured sigmas count less.", gt=0)
     max_iterations: int = setting(30, "Largest number of reweighted solves, twice.", ge=1)
-    min_points: int = setting(8, "A frame with fewer points has no say of its own and follows its neighbours.", ge=2)
+    min_points: int = setting(8, "A frame with fewer points has no say of its own and follows its neighbors.", ge=2)
     temporal_sigma: float = setting(
         0.1, "Aligned inverse depth changes from frame to frame by about this part through scale and shift alone.",
         gt=0,

@@ -45,7 +45,7 @@ class Config(Section):
     )
     solver: Literal["lm", "adam"] = setting(
         "lm",
-        "Minimiser of every stage: 'lm' is Levenberg-Marquardt; 'adam' is the first-order baseline, which needs "
+        "Minimizer of every stage: 'lm' is Levenberg-Marquardt; 'adam' is the first-order baseline, which needs "
         "PyTorch and is made for the preset 'paper'.",
         basic=True,
     )

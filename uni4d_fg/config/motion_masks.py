@@ -51,7 +51,7 @@ class MotionMaskConfig(Section):
     depth_sigma: float = setting(0.03, "Standard deviation of log depth within a frame.", gt=0)
     depth_edge_px: float = setting(
         25.0,
-        "Depth may be displaced against colour by up to half of this, px: near a depth edge, motion along the "
+        "Depth may be displaced against color by up to half of this, px: near a depth edge, motion along the "
         "direction in which depth would explain it does not count.",
         ge=0,
     )  # fmt: skip
@@ -71,13 +71,13 @@ class MotionMaskConfig(Section):
         0.8, "Quantile of a track's departures over its frame pairs that is compared with both.", gt=0, le=1
     )
     track_weight: float = setting(2.0, "Evidence of a track at its own pixel, in units of log odds.", ge=0)
-    intensity_sigma: float = setting(4.0, "Standard deviation of a pixel's intensity, grey levels.", gt=0)
+    intensity_sigma: float = setting(4.0, "Standard deviation of a pixel's intensity, gray levels.", gt=0)
     occlusion_margin: float = setting(
         0.1, "A point is hidden in another frame whose depth there is smaller by more than this fraction.", gt=0
     )
-    smoothing_px: int = setting(16, "Radius within which evidence is shared among like colours, px.", ge=1)
-    smoothing_contrast: float = setting(0.03, "Standard deviation of colour (0 to 1) within one surface.", gt=0)
-    neighbour_frames_weight: float = setting(
+    smoothing_px: int = setting(16, "Radius within which evidence is shared among like colors, px.", ge=1)
+    smoothing_contrast: float = setting(0.03, "Standard deviation of color (0 to 1) within one surface.", gt=0)
+    neighbor_frames_weight: float = setting(
         0.5, "Weight of the evidence of the frames before and after, warped by flow.", ge=0
     )  # fmt: skip
     threshold: float = setting(1.0, "Log odds above which a pixel moves.", basic=True)
@@ -107,7 +107,7 @@ class MotionMaskConfig(Section):
         1e-3, "Weight that holds this fit at zero, as a part of the weight of the tracks.", gt=0
     )
     blur_px: float = setting(1.5, "Standard deviation of the blur before images are compared, working px.", gt=0)
-    patch_px: int = setting(5, "Side of the patch over which differences of colour are averaged, working px.", ge=1)
+    patch_px: int = setting(5, "Side of the patch over which differences of color are averaged, working px.", ge=1)
     contrast_window_px: int = setting(
         15, "Side of the window whose contrast says how a moved pixel would differ, working px.", ge=3
     )

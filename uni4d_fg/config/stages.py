@@ -81,7 +81,7 @@ class BundleAdjustmentConfig(Section):
     depth_sigma_factor: float = setting(
         3.5,
         "The depth prior of the camera solves is this much wider than its correlation along tracks says: a cue errs "
-        "alike in neighbouring pixels too.",
+        "alike in neighboring pixels too.",
         gt=0,
         basic=True,
     )
@@ -111,7 +111,7 @@ class BundleAdjustmentConfig(Section):
     )
     outlier_quantile: float = setting(
         0.98,
-        "Landmarks whose mean squared neighbour distance lies above this quantile (times outlier_factor) are dropped.",
+        "Landmarks whose mean squared neighbor distance lies above this quantile (times outlier_factor) are dropped.",
         gt=0,
         le=1,
     )
@@ -142,10 +142,10 @@ class BundleAdjustmentConfig(Section):
 class NonRigidConfig(Section):
     """Stage 3: one point per dynamic track and frame, cameras frozen."""
 
-    neighbours: int = setting(6, "ARAP neighbours per track, within its own instance.", ge=0, basic=True)
-    max_neighbour_ratio: float = setting(
+    neighbors: int = setting(6, "ARAP neighbors per track, within its own instance.", ge=0, basic=True)
+    max_neighbor_ratio: float = setting(
         6.0,
-        "Neighbours farther than this many times the instance's median neighbour distance are not linked.",
+        "Neighbors farther than this many times the instance's median neighbor distance are not linked.",
         gt=0,
     )
     min_observations: int = setting(3, "Dynamic tracks seen in fewer frames are dropped.", ge=1)
@@ -157,7 +157,7 @@ class NonRigidConfig(Section):
         "Estimate a track's points in the frames between its first and last observation in which it is hidden.",
         basic=True,
     )
-    local_scale_neighbours: int = setting(
+    local_scale_neighbors: int = setting(
         32,
         "The depth cue at a moving point is scaled by the median over this many nearest static observations, where "
         "that predicts better than the frame's scale; 0 always takes the frame's scale.",
@@ -182,7 +182,7 @@ class NonRigidConfig(Section):
     )
     smoothness_weight: float = setting(1.0, "Weight of temporal smoothness; 0 switches the term off.", ge=0, basic=True)
     smoothness_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
-    arap_sigma_m: float = setting(0.01, "Sigma of the change of a neighbour distance, m.", gt=0, basic=True)
+    arap_sigma_m: float = setting(0.01, "Sigma of the change of a neighbor distance, m.", gt=0, basic=True)
     arap_weight: float = setting(1.0, "Weight of ARAP; 0 switches the term off.", ge=0, basic=True)
     arap_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
     annealing: tuple[float, ...] = setting(
@@ -191,7 +191,7 @@ class NonRigidConfig(Section):
     warm_up_reprojection_weight: float = setting(
         0.01,
         "A first, loose solve multiplies the weight of E_NR by this, so that a point with a wrong cue follows its "
-        "neighbours and its own path before it is held to its ray; 1 leaves that solve out.",
+        "neighbors and its own path before it is held to its ray; 1 leaves that solve out.",
         gt=0,
         le=1,
     )
@@ -234,7 +234,7 @@ class JointConfig(Section):
 class FusionConfig(Section):
     """Dense depth that agrees with the sparse points, and the 4D cloud."""
 
-    neighbours: int = setting(3, "Control points per pixel (nearest in 3D, of the pixel's own instance).", ge=1)
+    neighbors: int = setting(3, "Control points per pixel (nearest in 3D, of the pixel's own instance).", ge=1)
     smoothing: int = setting(
         16,
         "Each control point's scale is the median over this many nearest control points; 1 keeps it raw.",

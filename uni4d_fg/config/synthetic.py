@@ -35,7 +35,7 @@ class SyntheticSceneConfig(Section):
     grid_rows: int = setting(24, "Query points per column of the grid.", ge=2)
     query_interval: int = setting(10, "A new grid of tracks is started every this many frames.", ge=1)
     margin_px: float = setting(6.0, "Distance of the outermost query points from the image border, px.", ge=0)
-    render_images: bool = setting(True, "Shade the images; otherwise they are flat grey and nothing is spent.")
+    render_images: bool = setting(True, "Shade the images; otherwise they are flat gray and nothing is spent.")
     noise: CueNoise = setting(CueNoise(), "Noise of the cues.")
     seed: int = setting(0, "Seed of the noise.", ge=0)
 

@@ -13,7 +13,7 @@ m_t is the frame's median 1/z, sigma the measured noise, rho a robust kernel (Ca
 from Huber's); q runs over some quantiles of the
 network's values at the points, so that tau says how much the aligned inverse depth may change from frame to frame
 through a and b alone, whatever the network's own unit and origin. A frame with many points hardly feels it; one
-with few follows its neighbours.
+with few follows its neighbors.
 
 Nothing keeps ``a d + b`` positive where the network is far: depth is cut at ``max_depth_ratio`` times the
 median of the frame. Iteratively reweighted least squares; the normal equations are block tridiagonal.
@@ -150,7 +150,7 @@ def align_affine(
     if not use.all():
         warnings.append(
             f"relative depth of {int((~use).sum())} frame(s) has too few points (or contradicts them) and takes scale "
-            f"and shift from its neighbours: {some_of(np.flatnonzero(~use).tolist())}"
+            f"and shift from its neighbors: {some_of(np.flatnonzero(~use).tolist())}"
         )
     depths = AlignedDepths(inverse_depth, fit.scale, fit.shift, floor)
     return AffineAlignment(depths, fit.scale, fit.shift, fit.sigma, points, tuple(warnings))

@@ -1,7 +1,7 @@
 r"""Does a pixel look in other frames as a static scene would have it?
 
 Frame j is compared with frame i at the pixel where i's depth and the cameras put each of its points
-(:mod:`uni4d_fg.cues.static_scene`). The difference of colours ``e`` in a small window has, for a static point,
+(:mod:`uni4d_fg.cues.static_scene`). The difference of colors ``e`` in a small window has, for a static point,
 the variance of the intensities plus what an error of the predicted pixel makes of the image gradient ``g``,
 
     s^2 = sigma_I^2 + g^T S g,    S = sigma_u^2 I + (sigma_z du')(sigma_z du')^T,
@@ -31,14 +31,14 @@ _SAMPLE = 4
 
 @dataclass(frozen=True)
 class FrameAppearance:
-    """One frame at working size, with what its comparisons need; arrays (h, w), intensities in grey levels."""
+    """One frame at working size, with what its comparisons need; arrays (h, w), intensities in gray levels."""
 
-    colour: Float32Array
+    color: Float32Array
     """(h, w, 3), slightly blurred."""
     gradient: tuple[Float32Array, Float32Array, Float32Array]
-    """Sums over colours of gx gx, gx gy, gy gy."""
+    """Sums over colors of gx gx, gx gy, gy gy."""
     contrast: Float32Array
-    """Variance of the colours around, summed over them."""
+    """Variance of the colors around, summed over them."""
     depth: DepthRange
     """With the frame's depth scale."""
 
@@ -50,18 +50,18 @@ def frame_appearance(
 
     Args:
         image: (h, w, 3) uint8 RGB at working size.
-        depth: (h, w) metres, NaN where missing.
+        depth: (h, w) meters, NaN where missing.
         log_scale: Log of the factor that makes the depth agree with the cameras.
         edge_window_px: Side of the window in which depth may be displaced.
         config: Blur and windows.
     """
-    colour = cv2.GaussianBlur(image, (0, 0), config.blur_px).astype(np.float32)
-    gx, gy = (cv2.Sobel(colour, -1, 1 - axis, axis, ksize=3) / 8 for axis in (0, 1))
+    color = cv2.GaussianBlur(image, (0, 0), config.blur_px).astype(np.float32)
+    gx, gy = (cv2.Sobel(color, -1, 1 - axis, axis, ksize=3) / 8 for axis in (0, 1))
     window = (config.contrast_window_px, config.contrast_window_px)
-    variance = cv2.boxFilter(colour * colour, -1, window) - cv2.boxFilter(colour, -1, window) ** 2
+    variance = cv2.boxFilter(color * color, -1, window) - cv2.boxFilter(color, -1, window) ** 2
     scaled = depth * np.float32(np.exp(log_scale))
     return FrameAppearance(
-        colour,
+        color,
         ((gx * gx).sum(axis=2), (gx * gy).sum(axis=2), (gy * gy).sum(axis=2)),
         np.maximum(variance, 0).sum(axis=2),
         depth_range(scaled, edge_window_px),
@@ -91,8 +91,8 @@ def moved_evidence(
     static = predict_static(columns, rows, source.depth.log_depth, target_T_source, intrinsics)
     u, v = (static.u + shared[0]).astype(np.float32), (static.v + shared[1]).astype(np.float32)
     inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
-    seen = cv2.remap(target.colour, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    difference = source.colour - seen
+    seen = cv2.remap(target.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    difference = source.color - seen
     some = inside[::_SAMPLE, ::_SAMPLE]
     if not some.any():
         return np.zeros((height, width), np.float32)

@@ -57,7 +57,7 @@ class SizeSpec(Section):
     length: int | None = setting(None, "Side of 'longest' and 'shortest', px.", ge=1)
     multiple_of: int = setting(1, "Both sides become the nearest multiple of this.", ge=1)
     keep_aspect: bool = setting(True, "Of 'fixed': fit the image into the size and pad, instead of stretching it.")
-    pad: Literal["centre", "end"] = setting("centre", "Where the image is placed when it is padded.")
+    pad: Literal["center", "end"] = setting("center", "Where the image is placed when it is padded.")
     pad_color: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "RGB of the padding, 0 to 255.")
 
     @model_validator(mode="after")
@@ -74,8 +74,8 @@ class DepthOutput(Section):
 
     name: str = required("Name of the output tensor: (1, H, W), (1, C, H, W) or (1, H, W, C).")
     kind: Literal["metric_depth", "canonical_depth", "inverse_depth", "affine_disparity"] = required(
-        "'metric_depth': metres; 'canonical_depth': metres for a camera of 'canonical_focal_px'; 'inverse_depth': "
-        "1 / metres; 'affine_disparity': 1 / depth up to an unknown scale and shift."
+        "'metric_depth': meters; 'canonical_depth': meters for a camera of 'canonical_focal_px'; 'inverse_depth': "
+        "1 / meters; 'affine_disparity': 1 / depth up to an unknown scale and shift."
     )
     channel: int | None = setting(None, "Channel to take where there are several (2 of a point map is z).", ge=0)
     canonical_focal_px: float | None = setting(None, "Of 'canonical_depth': focal length at the network's size.", gt=0)
@@ -106,8 +106,8 @@ class IntrinsicsOutput(Section):
         "'matrix': (3, 3), px at the network's size; 'focal_px': focal length, px at the network's width; 'fov_deg', "
         "'fov_rad': horizontal field of view of the image.",
     )
-    pixel_centre: float = setting(
-        0.5, "Coordinate of the centre of the first pixel in the principal point of 'matrix': 0 or 0.5.", ge=0, le=0.5
+    pixel_center: float = setting(
+        0.5, "Coordinate of the center of the first pixel in the principal point of 'matrix': 0 or 0.5.", ge=0, le=0.5
     )
 
 
@@ -118,7 +118,7 @@ class BaseCard(Section):
     title: str = required("Name of the network, for messages.")
     file: str = required("ONNX file, relative to the folder of the card or to that of UNI4D_FG_MODELS.")
     sha256: str | None = setting(None, "SHA-256 of the file, hexadecimal; null: not checked.")
-    licence: str = required("Licence of the weights.")
+    license: str = required("License of the weights.")
     source: str = setting("", "Where the network is published.")
     export: str = required("How to make the ONNX file.")
     input: InputSpec = required("The image that goes in.")
@@ -146,7 +146,7 @@ class SegmentationOutputs(Section):
         "none", "Of 'semantic': what turns the output into probabilities; 'none' where it holds them."
     )
     candidates: str = setting(
-        "output0", "Of 'yolo_seg': (1, 4 + C + M, A): box centre and size, classes, coefficients."
+        "output0", "Of 'yolo_seg': (1, 4 + C + M, A): box center and size, classes, coefficients."
     )
     prototypes: str = setting("output1", "Of 'yolo_seg': (1, M, h, w).")
     boxes: str = setting("boxes", "Of 'masks': (N, 4) x0, y0, x1, y1, px at the network's size.")
@@ -177,8 +177,8 @@ class VideoSpec(Section):
     points: int | None = setting(None, "Points per call, where the file fixes it; null: any number.", ge=1)
     queries: str = required("Name of the input (1, N, 3) of queries.")
     query_order: Literal["txy", "tyx"] = required("What its three columns are: frame in the window, and pixel.")
-    pixel_centre: float = setting(
-        0.0, "Coordinate of the centre of the first pixel, in and out: 0 or 0.5.", ge=0, le=0.5
+    pixel_center: float = setting(
+        0.0, "Coordinate of the center of the first pixel, in and out: 0 or 0.5.", ge=0, le=0.5
     )
 
 

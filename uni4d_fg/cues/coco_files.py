@@ -177,8 +177,8 @@ def open_coco_masks(
     if everything and all(mask.track is not None for mask in everything):
         return TrackedMasks(path, by_frame, size, config.min_score)
     labels = CompressedLabels(size)
-    grey = images if images is not None else ConstantFrames(np.full((*size, 3), 128, np.uint8), len(names))
-    for numbers in associate_instances(_detections(path, by_frame, size), grey, config):
+    gray = images if images is not None else ConstantFrames(np.full((*size, 3), 128, np.uint8), len(names))
+    for numbers in associate_instances(_detections(path, by_frame, size), gray, config):
         labels.append(numbers)
     return labels
 

@@ -26,13 +26,13 @@ def shrink(image: ImageArray, size: tuple[int, int]) -> ImageArray:
     return np.asarray(cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA))
 
 
-def shrunk_grey(image: ImageArray, size: tuple[int, int]) -> ImageArray:
-    """Return an RGB image as grey levels of (height, width) ``size``."""
+def shrunk_gray(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    """Return an RGB image as gray levels of (height, width) ``size``."""
     return np.asarray(cv2.cvtColor(shrink(image, size), cv2.COLOR_RGB2GRAY))
 
 
 class DenseFlow:
-    """Flow between grey images of one size; one object serves a whole video.
+    """Flow between gray images of one size; one object serves a whole video.
 
     Args:
         fine: Follow small and fast things too, at twice the time.

@@ -24,7 +24,7 @@ class DepthEstimate:
     """What a network says of one frame."""
 
     values: Float32Array
-    """(H, W): z-depth in metres, or disparity up to scale and shift (see ``is_affine``); NaN where missing."""
+    """(H, W): z-depth in meters, or disparity up to scale and shift (see ``is_affine``); NaN where missing."""
     intrinsics: FloatArray | None
     """(4,) fx, fy, cx, cy, px of the image; None where the network says nothing of use."""
 
@@ -122,13 +122,13 @@ class DepthNetwork:
         spec = self.card.intrinsics
         values = outputs[spec.name].astype(np.float64)
         height, width = placement.image_size
-        centre = np.array([(width - 1) / 2, (height - 1) / 2])
+        center = np.array([(width - 1) / 2, (height - 1) / 2])
         if spec.kind == "matrix":
             if values.size != 9:
                 raise self.network.misfit(spec.name, values.shape, "(1, 3, 3)")
             matrix = values.reshape(3, 3)
             at_input = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-            at_input[2:] -= spec.pixel_centre
+            at_input[2:] -= spec.pixel_center
             found = placement.intrinsics_to_image(at_input)
         else:
             if values.size != 1:
@@ -139,5 +139,5 @@ class DepthNetwork:
             else:
                 angle = np.deg2rad(value) if spec.kind == "fov_deg" else value
                 focal = 0.5 * width / np.tan(0.5 * angle) if 0 < angle < np.pi else np.nan
-            found = np.array([focal, focal, *centre])
+            found = np.array([focal, focal, *center])
         return None if not np.isfinite(found).all() or implausible(found, placement.image_size) else found

@@ -1,4 +1,4 @@
-"""How much depth varies around a pixel: what its depth may be where depth and colour do not quite coincide."""
+"""How much depth varies around a pixel: what its depth may be where depth and color do not quite coincide."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def depth_range(depth: Float32Array, window_px: int) -> DepthRange:
     """Return the extremes of log depth in a window around every pixel.
 
     Args:
-        depth: (H, W) metres, NaN where missing.
+        depth: (H, W) meters, NaN where missing.
         window_px: Side of the window.
     """
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,4 +1,4 @@
-"""Edge-preserving smoothing: values are shared within surfaces of like colour (He, Sun and Tang 2013)."""
+"""Edge-preserving smoothing: values are shared within surfaces of like color (He, Sun and Tang 2013)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from uni4d_fg.arrays import Float32Array
 def guided_filter(guide: Float32Array, values: Float32Array, radius_px: int, contrast: float) -> Float32Array:
     """Smooth ``values`` so that their edges are those of ``guide``.
 
-    In every window the result is the affine function of the guide's colour that is nearest to the values.
+    In every window the result is the affine function of the guide's color that is nearest to the values.
 
     Args:
         guide: (h, w, 3), 0 to 1.

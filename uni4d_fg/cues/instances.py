@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.config.motion_masks import InstanceConfig
-from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_grey, shrunk_size, warp_back, working_scale
+from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray, shrunk_size, warp_back, working_scale
 from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
@@ -90,13 +90,13 @@ def associate_instances(
             )
         found = _worth_keeping(found, config)
         size = shrunk_size(image.shape[:2], working_scale(image.shape[:2], config.flow_size_px))
-        grey = shrunk_grey(image, size)
+        gray = shrunk_gray(image, size)
         if last is not None:
-            _move(instances, flow, grey, last)
+            _move(instances, flow, gray, last)
         small = [_shrunk_mask(mask, size) for mask in found.masks]
         number_of, next_number = _assign(instances, found, small, next_number, config)
         yield _paint(found, number_of, instances, image.shape[:2], config)
-        last = grey
+        last = gray
         instances = [i for i in instances if i.missed <= config.max_missed_frames and bool((i.mask > 0.5).any())]
 
 
@@ -133,10 +133,10 @@ def _shrunk_mask(mask: BoolArray, size: tuple[int, int]) -> Float32Array:
     return np.asarray(shrunk, np.float32)
 
 
-def _move(instances: list[_Instance], flow: DenseFlow, grey: ImageArray, last: ImageArray) -> None:
+def _move(instances: list[_Instance], flow: DenseFlow, gray: ImageArray, last: ImageArray) -> None:
     if not instances:
         return
-    flow_back = flow.between(grey, last)
+    flow_back = flow.between(gray, last)
     for instance in instances:
         if instance.missed:
             instance.moved_by_velocity()

@@ -77,7 +77,7 @@ def interpolate(points: SparseInverseDepth, image_size: tuple[int, int], stride:
     """
     height, width = image_size
     rows, columns = -(-height // stride), -(-width // stride)
-    # Centres as cv2.resize places them, so that its bilinear interpolation has no shift.
+    # Centers as cv2.resize places them, so that its bilinear interpolation has no shift.
     v = (np.arange(rows) + 0.5) * height / rows - 0.5
     u = (np.arange(columns) + 0.5) * width / columns - 0.5
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -98,13 +98,13 @@ def evaluate(points: SparseInverseDepth, uv: FloatArray) -> FloatArray:
 
 
 def supported(uv: FloatArray, inverse_depth: FloatArray, config: GeometricDepthConfig) -> BoolArray:
-    """Return which points (N,) have a few of their nearest neighbours in the image at a similar depth.
+    """Return which points (N,) have a few of their nearest neighbors in the image at a similar depth.
 
-    A wrong point stands alone; beside a depth edge there are neighbours on either side.
+    A wrong point stands alone; beside a depth edge there are neighbors on either side.
     """
-    if len(uv) <= config.support_neighbours:
+    if len(uv) <= config.support_neighbors:
         return np.ones(len(uv), dtype=bool)
-    _, index = cKDTree(uv).query(uv, k=config.support_neighbours + 1)
+    _, index = cKDTree(uv).query(uv, k=config.support_neighbors + 1)
     ratio = inverse_depth[index[:, 1:]] / inverse_depth[:, None]
     like = (ratio < config.support_ratio) & (ratio > 1.0 / config.support_ratio)
     result: BoolArray = np.count_nonzero(like, axis=1) >= config.min_supporters

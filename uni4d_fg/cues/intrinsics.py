@@ -60,14 +60,14 @@ def shared_intrinsics(per_frame: FloatArray) -> SharedIntrinsics | None:
 
 def robust_mean(values: FloatArray) -> tuple[float, float]:
     """Return the mean of (N,) values with Tukey's weights, and their robust standard deviation."""
-    centre = float(np.median(values))
-    sigma = _GAUSSIAN * float(np.median(np.abs(values - centre)))
+    center = float(np.median(values))
+    sigma = _GAUSSIAN * float(np.median(np.abs(values - center)))
     if sigma < _SMALL:
-        return centre, sigma
+        return center, sigma
     for _ in range(_ROUNDS):
-        ratio = (values - centre) / (_TUKEY * sigma)
+        ratio = (values - center) / (_TUKEY * sigma)
         weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-        previous, centre = centre, float((weight * values).sum() / weight.sum())
-        if abs(centre - previous) < _SMALL * max(1.0, abs(centre)):
+        previous, center = center, float((weight * values).sum() / weight.sum())
+        if abs(center - previous) < _SMALL * max(1.0, abs(center)):
             break
-    return centre, sigma
+    return center, sigma

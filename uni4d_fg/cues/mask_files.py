@@ -177,7 +177,7 @@ def _deva_ids(path: Path, classes: tuple[str, ...], class_names: dict[int, str] 
 def read_ids(path: Path) -> Int32Array:
     """Read a label map like :func:`~uni4d_fg.frontend.sequence.decode.read_mask`, but a palette PNG by its index.
 
-    Programs that write ids with a palette mean the index; the colours are only for looking at.
+    Programs that write ids with a palette mean the index; the colors are only for looking at.
 
     Returns:
         (H, W) int32.

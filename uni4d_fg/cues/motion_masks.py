@@ -5,7 +5,7 @@
 2. Every frame is compared with others before and after it as a static scene would look there
    (:mod:`uni4d_fg.cues.appearance`). Of the two directions the less suspicious one counts: what is hidden in one is
    mostly seen in the other.
-3. The evidence of pixels and tracks, and of the frames next to it, is smoothed within surfaces of like colour; regions
+3. The evidence of pixels and tracks, and of the frames next to it, is smoothed within surfaces of like color; regions
    above a threshold are kept unless their own tracks say that they are static (:mod:`uni4d_fg.cues.moving_regions`).
 4. Regions are joined to instances over time (:mod:`uni4d_fg.cues.instances`); those of few frames are dropped.
 
@@ -79,7 +79,7 @@ def motion_masks(
         config: Sigmas, thresholds and sizes.
         reporter: Progress.
         should_stop: Polled often.
-        solver: Stages 1 and 2 and their minimiser; None takes the defaults.
+        solver: Stages 1 and 2 and their minimizer; None takes the defaults.
 
     Raises:
         InputError: If depth or tracks do not fit the images, or depth is missing wherever there is a track.
@@ -182,7 +182,7 @@ class _Comparison:
         self.video, self.depths, self.tracks = video, depths, tracks
         self.cameras, self.motion, self.config = cameras, motion, config
         self.size = shrunk_size(video.image_size, working_scale(video.image_size, config.working_size_px))
-        # Pixel centres are integers: (u + 1/2) scales.
+        # Pixel centers are integers: (u + 1/2) scales.
         self.scale = np.array([self.size[1] / video.image_size[1], self.size[0] / video.image_size[0]])
         fx, fy, cx, cy = cameras.intrinsics
         sx, sy = self.scale
@@ -254,12 +254,12 @@ class _Comparison:
         return (x * sx).astype(np.float32), (y * sy).astype(np.float32)
 
     def _regions(self, frame: int, near: dict[int, Float32Array]) -> FrameDetections:
-        evidence, weight = near[frame].copy(), self.config.neighbour_frames_weight
+        evidence, weight = near[frame].copy(), self.config.neighbor_frames_weight
         others = [f for f in near if f != frame]
         if weight > 0 and others:
-            grey = self._grey(frame)
+            gray = self._gray(frame)
             for other in others:
-                flow = self.flow.between(grey, self._grey(other))
+                flow = self.flow.between(gray, self._gray(other))
                 evidence += weight * warp_back(near[other], flow)
             evidence /= 1 + weight * len(others)
         self._frame(frame)
@@ -267,6 +267,6 @@ class _Comparison:
         masks: BoolArray = trusted_components(region, self.tracks, self.motion, frame, self.config)
         return FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
 
-    def _grey(self, frame: int) -> ImageArray:
+    def _gray(self, frame: int) -> ImageArray:
         self._frame(frame)
         return np.asarray(cv2.cvtColor(self.images[frame], cv2.COLOR_RGB2GRAY))

@@ -54,7 +54,7 @@ def _splat(
 def moving_region(
     evidence: Float32Array, image: ImageArray, full_size: tuple[int, int], config: MotionMaskConfig
 ) -> BoolArray:
-    """Smooth evidence within surfaces of like colour and take what exceeds the threshold.
+    """Smooth evidence within surfaces of like color and take what exceeds the threshold.
 
     Args:
         evidence: (h, w) log odds at working size.

@@ -34,7 +34,7 @@ class NetworkDepth:
     """Depth of every frame by a network."""
 
     maps: FloatMaps
-    """T maps (H, W): metres, or disparity up to scale and shift per frame."""
+    """T maps (H, W): meters, or disparity up to scale and shift per frame."""
     is_affine: bool
     per_frame_intrinsics: FloatArray
     """(T, 4) px; NaN rows where the network says nothing."""

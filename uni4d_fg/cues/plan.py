@@ -162,7 +162,7 @@ class CueReport:
     facts: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     metric: bool = True
-    """Whether depth is in metres."""
+    """Whether depth is in meters."""
     settings: Config | None = None
     """The configuration to reconstruct with, where these cues ask for another one."""
 

@@ -182,7 +182,7 @@ class PointTrackerNetwork:
             video = video.transpose(0, 1, 4, 2, 3)
         elif card.video.axes == "NTHWC" and card.input.layout == "NCHW":
             video = video.transpose(0, 1, 3, 4, 2)
-        at_input = placement.to_input(uv) + card.video.pixel_centre
+        at_input = placement.to_input(uv) + card.video.pixel_center
         columns = (asked[:, None], at_input) if card.video.query_order == "txy" else (asked[:, None], at_input[:, ::-1])
         queries = np.concatenate(columns, axis=1).astype(np.float32)
         chunk = card.video.points or min(_DEFAULT_POINTS, len(queries))
@@ -210,7 +210,7 @@ class PointTrackerNetwork:
             probability = probability * self._probability(spec.confidence, outputs, shape, spec.confidence_kind)
         if spec.order == "TN":
             positions, probability = positions.swapaxes(1, 2), probability.swapaxes(1, 2)
-        uv = placement.to_image(positions[0, :count].astype(np.float64) - card.video.pixel_centre)
+        uv = placement.to_image(positions[0, :count].astype(np.float64) - card.video.pixel_center)
         return uv.astype(np.float32), probability[0, :count].astype(np.float32)
 
     def _probability(

@@ -1,6 +1,6 @@
 """From an image to what a network takes, and back from its pixels to those of the image.
 
-Resampling follows pixel areas: pixel x of the image, whose centre is x, lies at ``(x + 0.5) * scale - 0.5 + offset``
+Resampling follows pixel areas: pixel x of the image, whose center is x, lies at ``(x + 0.5) * scale - 0.5 + offset``
 in the network's image.
 """
 
@@ -36,7 +36,7 @@ class Placement:
         return np.array([width / self.image_size[1], height / self.image_size[0]])
 
     def to_input(self, uv: FloatArray) -> FloatArray:
-        """Map (..., 2) pixels of the image to pixels of the input (centres at integers in both)."""
+        """Map (..., 2) pixels of the image to pixels of the input (centers at integers in both)."""
         top, left = self.content[:2]
         at_input: FloatArray = (uv + 0.5) * self.scale - 0.5 + np.array([left, top])
         return at_input
@@ -49,8 +49,8 @@ class Placement:
 
     def intrinsics_to_image(self, intrinsics: FloatArray) -> FloatArray:
         """Map (4,) fx, fy, cx, cy of the input to those of the image."""
-        centre = self.to_image(intrinsics[2:])
-        return np.concatenate((intrinsics[:2] / self.scale, centre))
+        center = self.to_image(intrinsics[2:])
+        return np.concatenate((intrinsics[:2] / self.scale, center))
 
     def restore(self, values: npt.NDArray[Any]) -> Float32Array:
         """Bring a map of the input, at whatever resolution it came out, to the size of the image.
@@ -97,7 +97,7 @@ def place(image_size: tuple[int, int], size: SizeSpec) -> Placement:
         factor = min(target[0] / height, target[1] / width)
         inner = (min(target[0], max(1, round(height * factor))), min(target[1], max(1, round(width * factor))))
         spare = (target[0] - inner[0], target[1] - inner[1])
-        top, left = (spare[0] // 2, spare[1] // 2) if size.pad == "centre" else (0, 0)
+        top, left = (spare[0] // 2, spare[1] // 2) if size.pad == "center" else (0, 0)
         return Placement(image_size, target, (top, left, *inner))
     factor = 1.0
     if size.rule != "image":
@@ -114,8 +114,8 @@ def prepare(image: ImageArray, placement: Placement, spec: InputSpec, size: Size
     Args:
         image: (H, W, 3) uint8 RGB of ``placement.image_size``.
         placement: From :func:`place`.
-        spec: Colours, scale and layout.
-        size: Colour of the padding.
+        spec: Colors, scale and layout.
+        size: Color of the padding.
     """
     top, left, height, width = placement.content
     shrinks = height < image.shape[0] or width < image.shape[1]

@@ -61,7 +61,7 @@ def solve_cameras(
     Args:
         labelled: Tracks; those that are STATIC or SHORT_STATIC count.
         intrinsics: (4,) px, known or to start from.
-        config: Both stages and the minimiser.
+        config: Both stages and the minimizer.
         free_intrinsics: Whether the focal lengths move.
         observations_per_frame: Tracks are thinned to about this many observations per frame.
         should_stop: Polled by the solves.

@@ -1,4 +1,4 @@
-r"""As-rigid-as-possible: the distance of two neighbouring dynamic points does not change from frame to frame.
+r"""As-rigid-as-possible: the distance of two neighboring dynamic points does not change from frame to frame.
 
     r = d(p_{k,t}, p_{m,t}) - d(p_{k,t+1}, p_{m,t+1}),   d(p, q) = sqrt(|p - q|^2 + epsilon^2)   [m], 1-vector
 

@@ -2,7 +2,7 @@ r"""Depth prior: a point's depth agrees with the depth cue up to one log-scale p
 
     r = log(z) - log(D_t(z_{k,t})) - s_t,   z = e_z^T R_t^T (p - c_t)        [dimensionless], 1-vector
 
-``depth`` is the cue at the observation (metres), ``log_scale`` the frame's s_t: the cue is too small by the
+``depth`` is the cue at the observation (meters), ``log_scale`` the frame's s_t: the cue is too small by the
 factor exp(s_t). Below the near plane log is continued by its tangent, so that a point behind the camera is
 pushed forward. Three types: on pose, landmark and log-scale (stage 2), on a dynamic point with frozen camera
 and log-scale (stage 3), and on pose, dynamic point and log-scale (joint energy). Not in the paper: without it

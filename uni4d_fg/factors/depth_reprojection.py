@@ -1,10 +1,10 @@
-r"""Depth reprojection of a frame pair, the energy of camera initialisation.
+r"""Depth reprojection of a frame pair, the energy of camera initialization.
 
     r = z_{k,j} - pi_K( R_j^T ( R_i x_i + c_i - c_j ) ),   x_i = pi_K^{-1}(z_{k,i}, D_i(z_{k,i}))   [px]
 
-The pixel ``uv_source`` of frame i is lifted with its ``depth`` cue (metres, taken as truth here), moved by
+The pixel ``uv_source`` of frame i is lifted with its ``depth`` cue (meters, taken as truth here), moved by
 the two poses and compared with the pixel ``uv_target`` of the same track in frame j. Variables: both poses
-and the shared intrinsics, which act twice (lifting and projecting). Source: Uni4D, camera initialisation.
+and the shared intrinsics, which act twice (lifting and projecting). Source: Uni4D, camera initialization.
 """
 
 from __future__ import annotations

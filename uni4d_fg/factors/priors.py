@@ -97,7 +97,7 @@ def log_scale_deviation_jacobian(log_scale: FloatArray, cue_scale: FloatArray) -
 
 @factor(POSE, POSE, data={"distance": ()}, dim=1)
 def scale_anchor(first: Array, second: Array, *, distance: Array) -> Array:
-    """Return (N, 1) of two poses (N, 4, 4) and the distance of their centres (N,), m."""
+    """Return (N, 1) of two poses (N, 4, 4) and the distance of their centers (N,), m."""
     xp = namespace(first)
     d = second[..., :3, 3] - first[..., :3, 3]
     length = xp.sqrt(xp.sum(d * d, axis=-1) + _MIN_DISTANCE**2)

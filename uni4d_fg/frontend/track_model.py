@@ -20,7 +20,7 @@ class TrackLabel(IntEnum):
     DYNAMIC = 1
     """On one moving instance in every frame in which it is surely seen."""
     SHORT_STATIC = 2
-    """Static but seen in too few frames for camera initialisation; used after bundle adjustment."""
+    """Static but seen in too few frames for camera initialization; used after bundle adjustment."""
     REJECTED = 3
     """Mixed, never surely seen, or switching between instances."""
 
@@ -84,7 +84,7 @@ class LabelledTracks:
     weight: Float32Array
     """(K, T) in [0, 1]: 0 where not visible or dropped, below 1 inside the uncertain band of a mask."""
     depth: Float32Array
-    """(K, T) metres: the depth cue at each observation (bilinear), NaN where missing or not visible."""
+    """(K, T) meters: the depth cue at each observation (bilinear), NaN where missing or not visible."""
 
     def counts(self) -> dict[str, int]:
         """Return the number of tracks per label name."""

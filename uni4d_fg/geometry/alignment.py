@@ -30,7 +30,7 @@ class Similarity:
     rotation: FloatArray
     """(3, 3)."""
     translation: FloatArray
-    """(3,) metres of the reference."""
+    """(3,) meters of the reference."""
     scale: float
     """Reference length per estimate length."""
     degenerate: Degeneracy = "none"
@@ -41,12 +41,12 @@ class Similarity:
         return cls(np.eye(3), np.zeros(3), 1.0)
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """Map points (..., 3), metres; NaN stays NaN."""
+        """Map points (..., 3), meters; NaN stays NaN."""
         result: FloatArray = self.scale * (points @ self.rotation.T) + self.translation
         return result
 
     def apply_poses(self, world_T_cam: FloatArray) -> FloatArray:
-        """Map camera poses (T, 4, 4): centres as points, orientations by the rotation alone."""
+        """Map camera poses (T, 4, 4): centers as points, orientations by the rotation alone."""
         out = np.array(world_T_cam, dtype=np.float64)
         out[:, :3, :3] = self.rotation @ world_T_cam[:, :3, :3]
         out[:, :3, 3] = self.apply(world_T_cam[:, :3, 3])
@@ -69,7 +69,7 @@ def align_points(
 
     Args:
         estimate: (N, 3) points; pairs with a value that is not finite are left out.
-        reference: (N, 3) their counterparts, metres.
+        reference: (N, 3) their counterparts, meters.
         with_scale: Estimate the scale (Sim(3)); else keep 1 (SE(3)).
         estimate_rotations: (N, 3, 3) camera orientations, used only where positions leave the rotation open.
         reference_rotations: (N, 3, 3) their counterparts.
@@ -109,7 +109,7 @@ def align_points(
 
 
 def align_trajectories(estimate: FloatArray, reference: FloatArray, *, with_scale: bool = True) -> Similarity:
-    """Align camera poses (T, 4, 4) by their centres, with their orientations for what centres leave open."""
+    """Align camera poses (T, 4, 4) by their centers, with their orientations for what centers leave open."""
     return align_points(
         estimate[:, :3, 3],
         reference[:, :3, 3],
@@ -153,7 +153,7 @@ def _nearest_rotation(matrix: FloatArray) -> FloatArray:
 def _rotation_about_line(source: FloatArray, target: FloatArray, spread: FloatArray) -> FloatArray:
     """Return the rotation taking unit ``source`` to ``target`` that agrees best with the orientations.
 
-    All such rotations are Rot(target, angle) @ R0; the angle maximises trace(R^T spread) in closed form.
+    All such rotations are Rot(target, angle) @ R0; the angle maximizes trace(R^T spread) in closed form.
     """
     axis = np.cross(source, target)
     sine, cosine = float(np.linalg.norm(axis)), float(source @ target)

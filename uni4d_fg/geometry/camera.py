@@ -1,6 +1,6 @@
 r"""The pinhole camera: projection, lifting, and a cheirality policy that pushes.
 
-Pixels ``uv`` have x to the right, y down and centres at integers. Camera axes are OpenCV's (x right,
+Pixels ``uv`` have x to the right, y down and centers at integers. Camera axes are OpenCV's (x right,
 y down, z forward). ``intrinsics`` is ``(fx, fy, cx, cy)`` in pixels; there is no skew or distortion.
 
 A plain projection has no useful gradient behind the camera: the point jumps through infinity. Here the
@@ -18,11 +18,11 @@ from __future__ import annotations
 from uni4d_fg.arrays import Array, namespace
 
 NEAR_PLANE = 0.02
-"""Depth in metres below which the inverse depth is continued linearly."""
+"""Depth in meters below which the inverse depth is continued linearly."""
 
 
 def inverse_depth(z: Array, near: float = NEAR_PLANE) -> Array:
-    """Return g(z) of the module docstring. Args: ``z`` of any shape, metres. Returns the same shape, 1/m."""
+    """Return g(z) of the module docstring. Args: ``z`` of any shape, meters. Returns the same shape, 1/m."""
     xp = namespace(z)
     safe = xp.where(z >= near, z, near)
     return xp.where(z >= near, 1.0 / safe, (2.0 * near - z) / near**2)
@@ -40,7 +40,7 @@ def project(intrinsics: Array, point_cam: Array, near: float = NEAR_PLANE) -> Ar
 
     Args:
         intrinsics: (..., 4) fx, fy, cx, cy in px, broadcast against the points.
-        point_cam: (..., 3) points in the camera frame, metres.
+        point_cam: (..., 3) points in the camera frame, meters.
         near: Depth below which the inverse depth is continued linearly.
 
     Returns:
@@ -59,10 +59,10 @@ def unproject(intrinsics: Array, uv: Array, depth: Array) -> Array:
     Args:
         intrinsics: (..., 4) fx, fy, cx, cy in px.
         uv: (..., 2) pixels.
-        depth: (...) z-depth in metres.
+        depth: (...) z-depth in meters.
 
     Returns:
-        (..., 3) points in the camera frame, metres.
+        (..., 3) points in the camera frame, meters.
     """
     xp = namespace(uv)
     x = (uv[..., 0] - intrinsics[..., 2]) / intrinsics[..., 0] * depth
@@ -75,10 +75,10 @@ def world_to_camera(world_T_cam: Array, point_world: Array) -> Array:
 
     Args:
         world_T_cam: (..., 4, 4) camera poses.
-        point_world: (..., 3) world points, metres.
+        point_world: (..., 3) world points, meters.
 
     Returns:
-        (..., 3) camera-frame points, metres.
+        (..., 3) camera-frame points, meters.
     """
     xp = namespace(point_world)
     d = point_world - world_T_cam[..., :3, 3]

@@ -100,9 +100,9 @@ def orthonormalize(transform: FloatArray) -> FloatArray:
 def adjoint(transform: FloatArray) -> FloatArray:
     """Return Ad (6, 6) of a rigid transform: ``T Exp(xi) = Exp(Ad xi) T``, rotation first."""
     out = np.zeros((6, 6))
-    rotation, centre = transform[:3, :3], transform[:3, 3]
+    rotation, center = transform[:3, :3], transform[:3, 3]
     out[:3, :3] = out[3:, 3:] = rotation
-    out[3:, :3] = skew(centre) @ rotation
+    out[3:, :3] = skew(center) @ rotation
     return out
 
 

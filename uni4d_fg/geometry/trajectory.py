@@ -21,7 +21,7 @@ class Trajectory:
     timestamps: FloatArray
     """(T,) seconds, not decreasing."""
     world_T_cam: FloatArray
-    """(T, 4, 4) camera to world, metres."""
+    """(T, 4, 4) camera to world, meters."""
 
     def __post_init__(self) -> None:
         count = len(self.timestamps)

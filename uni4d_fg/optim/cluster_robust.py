@@ -1,14 +1,14 @@
-r"""Covariances of the cameras when errors are alike along tracks and among neighbours.
+r"""Covariances of the cameras when errors are alike along tracks and among neighbors.
 
 The marginals of :mod:`uni4d_fg.optim.marginals` count every observation as new information. Trackers err alike from
-frame to frame and from point to neighbouring point, and so do depth cues: there is less. Let ``u_k`` be what the
+frame to frame and from point to neighboring point, and so do depth cues: there is less. Let ``u_k`` be what the
 observations of landmark k pull the cameras with, after the landmark has been eliminated. Landmarks are put into
 clusters, errors may be anything within a cluster and are independent between clusters, and
 
     cov(d_c) = A^{-1} (sum_g u_g u_g^T  +  B_0) A^{-1},      u_g = sum of u_k over the cluster,
 
 where A is the reduced Hessian with the mean slope of each kernel (not the weight of reweighted least squares, which is
-larger), and B_0 the information of factors without landmarks. No correlation has to be modelled: it is in the sums.
+larger), and B_0 the information of factors without landmarks. No correlation has to be modeled: it is in the sums.
 With independent errors of the factors' sigmas this is A^{-1} again, known from about as many samples as there are
 clusters. Errors that all clusters share (lens distortion that is alike everywhere) are not seen.
 Source: Huber 1967, "The behavior of maximum likelihood estimates under nonstandard conditions"; Liang and Zeger 1986,

@@ -1,4 +1,4 @@
-"""Poses from depth reprojection, in C++: the normal equations of camera initialisation.
+"""Poses from depth reprojection, in C++: the normal equations of camera initialization.
 
 The factors of a frame pair share their relative pose, so that each adds to one small block of its pair and the
 pair is spread over both poses at the end. Only free entries have a column: a window of a long video is a

@@ -1,7 +1,7 @@
 """Inexact Gauss-Newton for many trajectories of points, in C++ (package ``uni4d_fg_cpp``).
 
 The same method as :mod:`uni4d_fg.optim.trajectory_cg`, and the same results up to rounding. Factors are not
-multiplied as sparse matrices: distances between neighbours are evaluated once for the two factors that use
+multiplied as sparse matrices: distances between neighbors are evaluated once for the two factors that use
 them, and the product with J^T J is formed from one direction per distance and one weight per factor. Factors of other
 types on the points take part as linearized blocks.
 """

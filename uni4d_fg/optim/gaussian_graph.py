@@ -1,7 +1,7 @@
 """GTSAM's elimination as the linear solver: any nonlinear factor graph under our driver.
 
 The graph is linearized on a ``Values`` that Python holds, so that custom factors cost the same however many
-variables there are; inside GTSAM's own optimisers every callback copies all of them.
+variables there are; inside GTSAM's own optimizers every callback copies all of them.
 """
 
 from __future__ import annotations

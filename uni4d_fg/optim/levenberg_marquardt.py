@@ -65,7 +65,7 @@ def minimize(
     name: str = "solve",
     hooks: Hooks | None = None,
 ) -> tuple[StateT, SolveSummary]:
-    """Minimise an objective from ``state``.
+    """Minimize an objective from ``state``.
 
     Args:
         objective: Energy, linearization and retraction.

@@ -10,8 +10,8 @@ covariance, so that every pose is relative to the held one: the world's gauge is
 What this covariance means, and what it does not: it is the spread of the estimate over repeated noise if the
 sigmas of the factors are the true ones and errors are independent. Robust kernels count with the weights they
 have at the solution (iteratively reweighted least squares), so that observations a kernel trusts less inform
-less. Errors of a depth cue that are alike over neighbouring pixels or along a track are not seen except where
-the sigma was widened for them, outliers that a kernel did not recognise are not seen at all, and the
+less. Errors of a depth cue that are alike over neighboring pixels or along a track are not seen except where
+the sigma was widened for them, outliers that a kernel did not recognize are not seen at all, and the
 linearization is that of the solution.
 Source: Triggs et al. 2000, "Bundle adjustment - a modern synthesis", section 9; Kaess and Dellaert 2009.
 """
@@ -123,7 +123,7 @@ def camera_marginals(
 def inverse_of_positive_definite(matrix: FloatArray) -> FloatArray | None:
     """Invert a symmetric matrix (n, n) by Cholesky; None if it is not safely positive definite.
 
-    Rows and columns are scaled to a unit diagonal first, because radians, metres and pixels differ by orders of
+    Rows and columns are scaled to a unit diagonal first, because radians, meters and pixels differ by orders of
     magnitude; a scaled pivot below 1e-7 counts as undetermined.
     """
     if len(matrix) == 0:

@@ -4,12 +4,12 @@ Without them the depth cue is all there is: every frame's log-scale has a prior 
 
     sum_t (s_t / sigma)^2,
 
-and the cue's mean over the frames is the world's metre. A cue may be wrong as a whole, though, by far more than frame
+and the cue's mean over the frames is the world's meter. A cue may be wrong as a whole, though, by far more than frame
 differs from frame. Where something else knows lengths the prior is therefore on the deviation from a common log-scale,
 
     sum_t ((s_t - s) / sigma)^2 + s^2,
 
-so that T frames do not say T times over that the cue's metre is right. The distance that anchors a solve without
+so that T frames do not say T times over that the cue's meter is right. The distance that anchors a solve without
 depth prior is loosened likewise.
 """
 

@@ -9,7 +9,7 @@ from uni4d_fg.optim.stage import LevenbergMarquardtRunner, StageRunner
 
 
 def stage_runner(config: Config) -> StageRunner:
-    """Return the configured minimiser.
+    """Return the configured minimizer.
 
     Raises:
         MissingDependencyError: If it needs a package that is not installed.
@@ -23,7 +23,7 @@ def stage_runner(config: Config) -> StageRunner:
 
 
 def solver_settings(config: Config) -> tuple[str | Section, ...]:
-    """Return what of the configuration the minimiser reads besides the stages' own sections.
+    """Return what of the configuration the minimizer reads besides the stages' own sections.
 
     The backend counts as the one that is used: 'auto' is another one once the C++ extension is installed.
 
@@ -36,7 +36,7 @@ def solver_settings(config: Config) -> tuple[str | Section, ...]:
 
 
 def solver_facts(config: Config) -> dict[str, str]:
-    """Return what the run's summary says of the minimiser: 'solver', and for 'lm' its 'backend' and a 'hint'."""
+    """Return what the run's summary says of the minimizer: 'solver', and for 'lm' its 'backend' and a 'hint'."""
     if config.solver != "lm":
         return {"solver": config.solver}
     backend = choose_backend(config.backend)

@@ -13,7 +13,7 @@ in a fixed order, so that the result does not depend on the number of threads. M
 to landmarks and cameras alike, before elimination.
 Source: Triggs et al. 2000, "Bundle adjustment - a modern synthesis".
 
-With nothing to eliminate this is a dense normal-equation solver, as camera initialisation needs.
+With nothing to eliminate this is a dense normal-equation solver, as camera initialization needs.
 """
 
 from __future__ import annotations

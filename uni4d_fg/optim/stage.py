@@ -55,7 +55,7 @@ class Stage:
     schedules: tuple[tuple[Round, ...], ...] = ((Round(),),)
     """Ways to go: successive solves each, of which the last is exact. All start alike; the lowest end is kept."""
     own_world: bool = False
-    """Its world begins at a camera of its own, not at the video's first, and metres there may be others."""
+    """Its world begins at a camera of its own, not at the video's first, and meters there may be others."""
 
     @property
     def name(self) -> str:
@@ -123,7 +123,7 @@ class _Rounds:
         return *minimize(planned.objective, state, solver, name=name, hooks=hooks), planned.parts()
 
     def _plan(self, problem: Problem, state: State, solver: SolverConfig) -> Planned:
-        """Return what a round minimises."""
+        """Return what a round minimizes."""
         if self._planned is not None and isinstance(self._planned.objective, Reweightable):
             self._planned.objective.reweight(problem)
         else:

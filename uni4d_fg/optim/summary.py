@@ -14,7 +14,7 @@ class Termination(str, Enum):
     GRADIENT = "converged: gradient below tolerance"
     STEP = "converged: step below tolerance"
     ZERO_ENERGY = "converged: energy is zero"
-    NOTHING_TO_DO = "nothing to optimise: no factor reads a free variable"
+    NOTHING_TO_DO = "nothing to optimize: no factor reads a free variable"
     MAX_ITERATIONS = "stopped: iteration limit"
     DAMPING_LIMIT = "stopped: no damping gives a lower energy"
     EARLY_STOPPED = "stopped: no progress for the patience"

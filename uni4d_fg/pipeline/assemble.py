@@ -31,7 +31,7 @@ ValueT = TypeVar("ValueT")
 def assemble(
     sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion: Arrays, lens: Lens = PINHOLE
 ) -> Reconstruction:
-    """Bring the stages' results into one :class:`Reconstruction`, with colours from the images."""
+    """Bring the stages' results into one :class:`Reconstruction`, with colors from the images."""
     landmark_track = scene["landmark_track"].astype(np.int32)
     dynamic_track = motion["track"].astype(np.int32)
     colors = _track_colors(sequence, labelled, np.concatenate([landmark_track, dynamic_track]))
@@ -58,7 +58,7 @@ def assemble(
 
 
 def _track_colors(sequence: Sequence, labelled: LabelledTracks, tracks: Int32Array) -> ImageArray:
-    """Return the image colour of each track in the first frame that shows it, (N, 3) RGB."""
+    """Return the image color of each track in the first frame that shows it, (N, 3) RGB."""
     out = np.zeros((len(tracks), 3), dtype=np.uint8)
     if len(tracks) == 0:
         return out

@@ -276,9 +276,9 @@ def correct_cue(
     _, row = static.rows()
     z = world_to_camera(cameras.world_T_cam[static.frame], scene["landmarks"][row])[:, 2]
     measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
-    neighbours, samples = config.nonrigid.local_scale_neighbours, config.nonrigid.local_scale_samples
-    local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbours, samples)
-    fact = f"depth cue scaled per {'neighbourhood' if local.is_local else 'frame'}, noise {100 * local.sigma:.1f} %"
+    neighbors, samples = config.nonrigid.local_scale_neighbors, config.nonrigid.local_scale_samples
+    local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbors, samples)
+    fact = f"depth cue scaled per {'neighborhood' if local.is_local else 'frame'}, noise {100 * local.sigma:.1f} %"
     observations = replace(observations, depth=observations.depth * np.exp(local.log_scale))
     noise = replace(noise, depth_sigma=max(local.sigma, config.bundle_adjustment.min_depth_sigma))
     return observations, replace(cameras, log_scale=np.zeros_like(cameras.log_scale)), noise, [fact]

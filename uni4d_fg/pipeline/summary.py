@@ -21,7 +21,7 @@ class RunSummary:
     sequence: dict[str, Any]
     """Name, root, frames, image size."""
     solver: dict[str, str] = field(default_factory=dict)
-    """Minimiser, its backend, and a hint at a faster one."""
+    """Minimizer, its backend, and a hint at a faster one."""
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Per stage: seconds, peak memory, whether it was resumed, solves, dropped counts."""
     warnings: list[str] = field(default_factory=list)

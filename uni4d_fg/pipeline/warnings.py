@@ -20,7 +20,7 @@ def scene_warnings(
         given_intrinsics: (4,) fx, fy, cx, cy, px, that the solve started from.
         intrinsics: (4,) that it ended with.
         world_T_cam: (T, 4, 4) poses.
-        landmarks: (N, 3) world, metres.
+        landmarks: (N, 3) world, meters.
     """
     warnings = []
     change = float(np.abs(intrinsics[:2] / given_intrinsics[:2] - 1.0).max())

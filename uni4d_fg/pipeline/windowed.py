@@ -120,7 +120,7 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
         windowed.check_cancelled()
         parts.append(finish(scene_of(index), cameras, config.bundle_adjustment, windowed.run))
     solves += [solve_dict(s) for part in parts for s in part.solves]
-    dropped["landmark far from its neighbours"] = sum(part.dropped for part in parts)
+    dropped["landmark far from its neighbors"] = sum(part.dropped for part in parts)
     arrays = _joined_arrays(windows, joined, parts)
     summary = bundle_summary(windowed.sequence, arrays, int(sum(part.count.sum() for part in parts)), dropped, solves)
     summary["facts"].append(f"{len(windows)} windows of {len(windows[0])} frames, joined {config.windows.rounds} times")

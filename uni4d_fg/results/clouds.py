@@ -1,4 +1,4 @@
-"""Coloured point clouds as PLY files."""
+"""Colored point clouds as PLY files."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _MAX_PLY_HEADER = 4096
 
 
 def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
-    """Write a coloured cloud as binary PLY, whole or not at all; an empty cloud gives a file without points.
+    """Write a colored cloud as binary PLY, whole or not at all; an empty cloud gives a file without points.
 
     Args:
         path: The ``.ply`` file.
-        points: (N, 3) world positions, metres, finite.
+        points: (N, 3) world positions, meters, finite.
         colors: (N, 3) RGB.
 
     Raises:
@@ -31,7 +31,7 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
         MissingDependencyError: If Open3D cannot be loaded.
     """
     if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
-        raise OutputError(f"{path}: points {points.shape} and colours {colors.shape} must both be (N, 3)")
+        raise OutputError(f"{path}: points {points.shape} and colors {colors.shape} must both be (N, 3)")
     if not np.isfinite(points).all():
         raise OutputError(f"{path}: a point is NaN or infinite")
     if len(points) == 0:
@@ -48,7 +48,7 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
 
 
 def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
-    """Read a coloured cloud: points (N, 3), metres, and RGB (N, 3).
+    """Read a colored cloud: points (N, 3), meters, and RGB (N, 3).
 
     Raises:
         InputError: If the file is missing or no PLY.
@@ -67,7 +67,7 @@ def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
     if colors.shape != points.shape:
         colors = np.ones_like(points)
     if not (np.isfinite(points).all() and np.isfinite(colors).all()):
-        raise InputError(f"{path}: has points or colours that are NaN or infinite; make the clouds again")
+        raise InputError(f"{path}: has points or colors that are NaN or infinite; make the clouds again")
     return points, np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
@@ -80,7 +80,7 @@ def write_clouds(
 
     Args:
         folder: The run's folder.
-        static: Points (N, 3), metres, and RGB (N, 3).
+        static: Points (N, 3), meters, and RGB (N, 3).
         dynamic: The same for every frame in turn; may be a generator, one frame is held at a time.
 
     Returns:
@@ -99,7 +99,7 @@ def write_clouds(
 
 
 def _is_whole(path: Path, count: int) -> bool:
-    """Tell whether a PLY of ``count`` coloured points is complete: Open3D does not notice a full disk."""
+    """Tell whether a PLY of ``count`` colored points is complete: Open3D does not notice a full disk."""
     content = path.read_bytes()
     header, found, _ = content.partition(b"end_header\n")
     return bool(found) and len(content) - len(header) - len(found) == count * (3 * 4 + 3)

@@ -1,4 +1,4 @@
-"""Colours of points and cameras: by value, by instance."""
+"""Colors of points and cameras: by value, by instance."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
 
-STATIC_GREY = (150, 156, 164)
-UNKNOWN_GREY = (104, 109, 117)
+STATIC_GRAY = (150, 156, 164)
+UNKNOWN_GRAY = (104, 109, 117)
 BRIDGED_AMBER = (240, 165, 50)
 CURRENT_ORANGE = (255, 122, 26)
 
 _DARKEST = 0.12
-"""The colour map starts here: its first colours cannot be told from a dark background."""
+"""The color map starts here: its first colors cannot be told from a dark background."""
 
 _PALETTE = np.array(
     [
@@ -25,9 +25,9 @@ _PALETTE = np.array(
 
 
 def instance_colors(instance: Int32Array) -> ImageArray:
-    """Return a colour per instance id, (..., 3) RGB; 0, the static scene, is grey. Ids keep their colour."""
+    """Return a color per instance id, (..., 3) RGB; 0, the static scene, is gray. Ids keep their color."""
     out: ImageArray = _PALETTE[(np.asarray(instance) - 1) % len(_PALETTE)]
-    out[np.asarray(instance) <= 0] = STATIC_GREY
+    out[np.asarray(instance) <= 0] = STATIC_GRAY
     return out
 
 
@@ -39,7 +39,7 @@ def value_range(values: FloatArray) -> tuple[float, float]:
 
 
 def value_colors(values: FloatArray, bounds: tuple[float, float]) -> ImageArray:
-    """Return a colour per value, (..., 3) RGB: dark violet at the lower bound, yellow at the upper; grey for NaN."""
+    """Return a color per value, (..., 3) RGB: dark violet at the lower bound, yellow at the upper; gray for NaN."""
     low, high = bounds
     values = np.asarray(values, dtype=np.float64)
     known = ~np.isnan(values)
@@ -47,7 +47,7 @@ def value_colors(values: FloatArray, bounds: tuple[float, float]) -> ImageArray:
     out: ImageArray = np.rint(
         255.0 * matplotlib.colormaps["plasma"](_DARKEST + (1.0 - _DARKEST) * level)[..., :3]
     ).astype(np.uint8)
-    out[~known] = UNKNOWN_GREY
+    out[~known] = UNKNOWN_GRAY
     return out
 
 
@@ -61,10 +61,10 @@ def depth_bounds(maps: list[Float32Array]) -> tuple[float, float]:
 
 
 def css_gradient() -> str:
-    """Return the colours of :func:`value_colors` as a CSS gradient from left to right."""
+    """Return the colors of :func:`value_colors` as a CSS gradient from left to right."""
     return css_stops(value_colors(np.linspace(0.0, 1.0, 7), (0.0, 1.0)))
 
 
 def css_stops(colors: ImageArray) -> str:
-    """Return colours (N, 3) RGB, evenly spaced, as a CSS gradient from left to right."""
+    """Return colors (N, 3) RGB, evenly spaced, as a CSS gradient from left to right."""
     return "linear-gradient(to right," + ",".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in colors.tolist()) + ")"

@@ -1,4 +1,4 @@
-"""The fused depth of a run: one ``.npy`` (T, H, W) of float32 metres, never held in memory as a whole.
+"""The fused depth of a run: one ``.npy`` (T, H, W) of float32 meters, never held in memory as a whole.
 
 Frames are written with plain file writes and read back through a memory map. Writing through a memory map
 would end the process without a message when the disk is full; a plain write raises an error instead.
@@ -34,7 +34,7 @@ class DepthWriter:
     """Frame to the checksum of its map."""
 
     def write(self, frame: int, depth: npt.NDArray[np.floating]) -> None:
-        """Store one map (H, W), metres; values that are not positive and finite are stored as NaN.
+        """Store one map (H, W), meters; values that are not positive and finite are stored as NaN.
 
         Raises:
             ValueError: If the frame number or the size is not what was announced.
@@ -98,7 +98,7 @@ class StoredDepth(ArrayFrames):
 
 
 def read_depth(path: Path, *, whole: bool = False) -> StoredDepth:
-    """Return the depth maps of a run as T frames (H, W), float32 metres, memory-mapped; NaN where missing.
+    """Return the depth maps of a run as T frames (H, W), float32 meters, memory-mapped; NaN where missing.
 
     Args:
         path: The ``depth.npy`` of the run.

@@ -32,7 +32,7 @@ class Residuals:
     error: FloatArray
     """(N, 2) observed minus projected, px."""
     depth: FloatArray
-    """(N,) depth of the point in its camera, metres; ``error`` means nothing where it is not above the near plane."""
+    """(N,) depth of the point in its camera, meters; ``error`` means nothing where it is not above the near plane."""
     is_dynamic: BoolArray
     """(N,)."""
 
@@ -82,7 +82,7 @@ def reprojection_residuals(reconstruction: Reconstruction, labelled: LabelledTra
 
 
 def landmark_sigma(reconstruction: Reconstruction, residuals: Residuals) -> FloatArray:
-    """Return the standard deviation of each landmark's position from its rays alone, (N,) metres.
+    """Return the standard deviation of each landmark's position from its rays alone, (N,) meters.
 
     See the module's docstring; infinite where the rays do not determine it (one view, no parallax).
     """

@@ -104,7 +104,7 @@ class Run:
 
     @property
     def is_metric(self) -> bool:
-        """Whether lengths are metres, as far as is known; else they are of an unknown unit."""
+        """Whether lengths are meters, as far as is known; else they are of an unknown unit."""
         cues = self.summary.get("cues")
         return not isinstance(cues, dict) or cues.get("metric") is not False
 
@@ -115,7 +115,7 @@ class Run:
 
     @property
     def small_unit(self) -> tuple[float, str]:
-        """Factor and unit for small lengths: millimetres where lengths are metres."""
+        """Factor and unit for small lengths: millimeters where lengths are meters."""
         return (1000.0, "mm") if self.is_metric else (1.0, "units")
 
     @property
@@ -135,7 +135,7 @@ class Run:
 
     @property
     def depth(self) -> FrameSource[Float32Array] | None:
-        """T fused maps (H, W), metres, NaN where missing; absent in runs of ``stream``."""
+        """T fused maps (H, W), meters, NaN where missing; absent in runs of ``stream``."""
         return self._depth.value
 
     @property

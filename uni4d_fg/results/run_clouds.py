@@ -21,7 +21,7 @@ class ColoredPoints(NamedTuple):
     """A cloud whose points know their instance."""
 
     points: Float32Array
-    """(N, 3) world positions, metres."""
+    """(N, 3) world positions, meters."""
     colors: ImageArray
     """(N, 3) RGB."""
     instance: Int32Array

@@ -24,7 +24,7 @@ class RunFolder:
 
     @property
     def depth(self) -> Path:
-        """Fused depth (T, H, W), float32 metres (``.npy``)."""
+        """Fused depth (T, H, W), float32 meters (``.npy``)."""
         return self.root / "depth.npy"
 
     @property

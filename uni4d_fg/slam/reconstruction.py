@@ -26,7 +26,7 @@ class Reconstruction:
     """
 
     world_T_cam: FloatArray
-    """(T, 4, 4) camera to world, OpenCV axes, metres."""
+    """(T, 4, 4) camera to world, OpenCV axes, meters."""
     intrinsics: FloatArray
     """(4,) fx, fy, cx, cy, px."""
     timestamps: FloatArray
@@ -36,7 +36,7 @@ class Reconstruction:
     depth_log_scale: FloatArray
     """(T,) s_t: the depth cue of frame t is too small by the factor exp(s_t)."""
     landmarks: FloatArray
-    """(N, 3) static world points, metres."""
+    """(N, 3) static world points, meters."""
     landmark_track: Int32Array
     """(N,) index of each landmark's track in the labelled tracks."""
     landmark_color: ImageArray
@@ -44,7 +44,7 @@ class Reconstruction:
     landmark_error: Float32Array
     """(N,) median reprojection error, px."""
     dynamic_points: FloatArray
-    """(M, T, 3) world position of each dynamic track per frame, metres; NaN outside its estimated span."""
+    """(M, T, 3) world position of each dynamic track per frame, meters; NaN outside its estimated span."""
     dynamic_observed: BoolArray
     """(M, T) True where the point was seen, False where it is bridged by the motion prior."""
     dynamic_track: Int32Array
@@ -67,7 +67,7 @@ class Reconstruction:
     object_observed: BoolArray | None = None
     """(J, T) frames that see enough of the object; poses in between hang on the smoothness of its motion alone."""
     object_world_T_object: FloatArray | None = None
-    """(J, T, 4, 4) object to world, metres; NaN before the first and after the last frame that sees the object."""
+    """(J, T, 4, 4) object to world, meters; NaN before the first and after the last frame that sees the object."""
     object_covariance: FloatArray | None = None
     """(J, T, 6, 6) of the pose's body-frame twist (rotation rad, translation m), relative to the reference frame and
     with the cameras taken for exact; NaN where there is no pose or it is not determined."""

@@ -5,7 +5,7 @@
 
 namespace uni4d_fg {
 
-/// Depth in metres below which inverse depth and log depth are continued linearly.
+/// Depth in meters below which inverse depth and log depth are continued linearly.
 constexpr double kNearPlane = 0.02;
 
 /// fx, fy, cx, cy in px.
@@ -45,7 +45,7 @@ UNI4D_FG_INLINE Pixel project(const Intrinsics& k, const Vec3& x) {
   return {k.fx * x.x * g + k.cx, k.fy * x.y * g + k.cy};
 }
 
-/// Lift a pixel with its z-depth (metres) to the camera frame.
+/// Lift a pixel with its z-depth (meters) to the camera frame.
 UNI4D_FG_INLINE Vec3 unproject(const Intrinsics& k, double u, double v, double depth) {
   return {(u - k.cx) / k.fx * depth, (v - k.cy) / k.fy * depth, depth};
 }

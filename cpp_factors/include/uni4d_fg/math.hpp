@@ -105,7 +105,7 @@ UNI4D_FG_INLINE void add_symmetric_product(const double* s, const double* v, dou
 /// Matrix of the cross product, skew(v) w = v x w.
 UNI4D_FG_INLINE Mat3 skew(const Vec3& v) { return {{0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0}}; }
 
-/// world_T_cam: rotation and camera center (metres). Tangent: body-frame twist (omega, v), T <- T Exp(omega, v).
+/// world_T_cam: rotation and camera center (meters). Tangent: body-frame twist (omega, v), T <- T Exp(omega, v).
 struct Pose {
   Mat3 rotation;
   Vec3 center;

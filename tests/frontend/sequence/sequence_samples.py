@@ -37,7 +37,7 @@ def sample_sequence(
     ids: tuple[int, ...] = (0, 1, 7),
     num_tracks: int = TRACKS,
 ) -> Sequence:
-    """A sequence with every field filled; depth is in whole millimetres so that PNG keeps it."""
+    """A sequence with every field filled; depth is in whole millimeters so that PNG keeps it."""
     rng = np.random.default_rng(seed)
     depth = (rng.integers(500, 4000, (frames, HEIGHT, WIDTH)) / 1000).astype(np.float32)
     if far:

@@ -26,10 +26,10 @@ def test_color_image_is_rgb(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / "a.png")[0, 0], [200, 0, 0])
 
 
-def test_grey_alpha_and_16_bit_images(tmp_path: Path) -> None:
-    grey = np.array([[0, 100, 255]], np.uint8)
-    write_image(tmp_path / "grey.png", grey)
-    np.testing.assert_array_equal(read_image(tmp_path / "grey.png")[0, :, 1], [0, 100, 255])
+def test_gray_alpha_and_16_bit_images(tmp_path: Path) -> None:
+    gray = np.array([[0, 100, 255]], np.uint8)
+    write_image(tmp_path / "gray.png", gray)
+    np.testing.assert_array_equal(read_image(tmp_path / "gray.png")[0, :, 1], [0, 100, 255])
     alpha = np.full((2, 2, 4), (1, 2, 3, 9), np.uint8)
     write_image(tmp_path / "alpha.png", alpha)
     np.testing.assert_array_equal(read_image(tmp_path / "alpha.png")[1, 1], [3, 2, 1])
@@ -102,10 +102,10 @@ def test_depth_png_units_and_missing(tmp_path: Path) -> None:
 
 
 def test_pictures_of_depth_are_refused(tmp_path: Path) -> None:
-    write_image(tmp_path / "grey.png", np.zeros((2, 2), np.uint8))
+    write_image(tmp_path / "gray.png", np.zeros((2, 2), np.uint8))
     write_image(tmp_path / "jet.png", np.zeros((2, 2, 3), np.uint8))
-    for name in ("grey.png", "jet.png"):
-        with pytest.raises(InputError, match="save depth as 16-bit PNG in millimetres"):
+    for name in ("gray.png", "jet.png"):
+        with pytest.raises(InputError, match="save depth as 16-bit PNG in millimeters"):
             read_depth(tmp_path / name)
     np.save(tmp_path / "a.npy", np.zeros((2, 2), np.int32))
     with pytest.raises(InputError, match="int32"):

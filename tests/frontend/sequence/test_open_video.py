@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from sequence_samples import FRAMES, HEIGHT, WIDTH, native_folder, sample_sequence, uni4d_folder, write_image
-from video_samples import SIZE, grey_frames, set_durations, write_video
+from video_samples import SIZE, gray_frames, set_durations, write_video
 
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
@@ -68,7 +68,7 @@ def test_folder_of_images(tmp_path: Path) -> None:
 
 
 def test_video_file(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "my.clip.mov", grey_frames(9))
+    path = write_video(tmp_path / "my.clip.mov", gray_frames(9))
     video = open_video(path)
     assert (video.name, video.root, video.num_frames, video.image_size) == ("my.clip", path, 9, SIZE)
     assert video.intrinsics is video.depths is None
@@ -85,7 +85,7 @@ def test_video_file(tmp_path: Path) -> None:
 def test_video_in_a_folder_with_cues_of_all_its_frames(tmp_path: Path) -> None:
     root = tmp_path / "clip"
     root.mkdir()
-    write_video(root / "video.webm", grey_frames(9), "VP80")
+    write_video(root / "video.webm", gray_frames(9), "VP80")
     np.save(root / "depth_cue.npy", np.arange(1, 10, dtype=np.float32)[:, None, None] * np.ones(SIZE, np.float32))
     for i in range(9):
         write_image(root / "masks" / f"{i}.png", np.full(SIZE, i, np.uint8))
@@ -96,7 +96,7 @@ def test_video_in_a_folder_with_cues_of_all_its_frames(tmp_path: Path) -> None:
 
 
 def test_variable_frame_rate_is_kept_and_said(tmp_path: Path) -> None:
-    path = set_durations(write_video(tmp_path / "clip.mp4", grey_frames(6)), [1, 3, 2, 1, 4, 1])
+    path = set_durations(write_video(tmp_path / "clip.mp4", gray_frames(6)), [1, 3, 2, 1, 4, 1])
     np.testing.assert_allclose(open_video(path).timestamps, np.array([0, 1, 4, 6, 7, 11]) * 0.04, atol=2e-3)
     said = [f.message for f in validate_sequence(path).of("info") if f.item == "images"]
     assert len(said) == 1
@@ -104,7 +104,7 @@ def test_variable_frame_rate_is_kept_and_said(tmp_path: Path) -> None:
 
 
 def test_only_the_frames_before_stop_are_needed(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "clip.avi", grey_frames(12), "MJPG")
+    path = write_video(tmp_path / "clip.avi", gray_frames(12), "MJPG")
     data = path.read_bytes()
     path.write_bytes(data[: data.rindex(b"00dc", 0, data.index(b"idx1"))])
     with pytest.raises(InputError, match="is cut short"):
@@ -120,7 +120,7 @@ def one_image(folder: Path) -> Path:
 WRONG = {
     "absent": (lambda root: root / "absent", "no such folder or file"),
     "one image": (one_image, "is one image"),
-    "one frame": (lambda root: write_video(root / "clip.mp4", grey_frames(1)), r"has 1 frame\(s\); give at least 2"),
+    "one frame": (lambda root: write_video(root / "clip.mp4", gray_frames(1)), r"has 1 frame\(s\); give at least 2"),
     "empty folder": (lambda root: root, "there is no rgb/ and no video, nor are there images"),
     "one image in a folder": (lambda root: one_image(root).parent, r"has 1 frame\(s\)"),
     "phone pictures": (
@@ -142,7 +142,7 @@ def test_other_things(tmp_path: Path, kind: str) -> None:
 
 
 def test_cues_cannot_be_chosen_inside_a_file(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "clip.mp4", grey_frames(3))
+    path = write_video(tmp_path / "clip.mp4", gray_frames(3))
     with pytest.raises(InputError, match=r"no masks can be chosen by name; put it into a folder as video\.mp4"):
         open_video(path, masks="deva")
     with pytest.raises(InputError, match="a video file brings no depth; put it into a folder"):
@@ -179,7 +179,7 @@ def tagged(pixels: np.ndarray, orientation: int) -> bytes:
     return data[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + data[2:]
 
 
-@pytest.mark.parametrize("grey", [False, True])
+@pytest.mark.parametrize("gray", [False, True])
 @pytest.mark.parametrize(
     ("orientation", "column", "row"),
     [
@@ -187,8 +187,8 @@ def tagged(pixels: np.ndarray, orientation: int) -> bytes:
         (5, 4.5, 5.5), (6, 42.5, 5.5), (7, 42.5, 57.5), (8, 4.5, 57.5),
     ],
 )  # fmt: skip
-def test_exif_orientation(tmp_path: Path, orientation: int, column: float, row: float, grey: bool) -> None:
-    stored = np.zeros(SIZE if grey else (*SIZE, 3), np.uint8)
+def test_exif_orientation(tmp_path: Path, orientation: int, column: float, row: float, gray: bool) -> None:
+    stored = np.zeros(SIZE if gray else (*SIZE, 3), np.uint8)
     stored[:10, :12] = 250
     (tmp_path / "a.jpg").write_bytes(tagged(stored, orientation))
     image = read_image(tmp_path / "a.jpg")

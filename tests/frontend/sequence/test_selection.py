@@ -140,12 +140,12 @@ def test_images_and_maps_keep_their_place(factor: int) -> None:
     rows, columns = np.mgrid[0 : 12 * factor, 0 : 20 * factor]
     ramp = columns / factor * 8 + 20
     small = resize_image(np.repeat(np.rint(ramp).astype(np.uint8)[..., None], 3, axis=2), (12, 20))
-    centre = (np.arange(20) + 0.5) * factor - 0.5
-    np.testing.assert_allclose(small[5, :, 1], centre / factor * 8 + 20, atol=1.01)
+    center = (np.arange(20) + 0.5) * factor - 0.5
+    np.testing.assert_allclose(small[5, :, 1], center / factor * 8 + 20, atol=1.01)
     labels = (rows * 1000 + columns).astype(np.int32)
     taken = resize_nearest(labels, (12, 20))
     assert taken.dtype == np.int32
-    assert np.abs(taken[0] % 1000 - centre).max() <= 0.5
+    assert np.abs(taken[0] % 1000 - center).max() <= 0.5
     assert np.abs(taken[:, 0] // 1000 - ((np.arange(12) + 0.5) * factor - 0.5)).max() <= 0.5
 
 

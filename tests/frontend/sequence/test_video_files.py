@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from video_samples import SIZE, grey_frames, rotate, set_durations, table_first, write_video
+from video_samples import SIZE, gray_frames, rotate, set_durations, table_first, write_video
 
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence import video
@@ -28,7 +28,7 @@ def moving_frames(length: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(("codec", "suffix"), CONTAINERS)
 def test_containers(tmp_path: Path, codec: str, suffix: str) -> None:
-    frames = VideoFrames(write_video(tmp_path / f"clip{suffix}", grey_frames(9), codec))
+    frames = VideoFrames(write_video(tmp_path / f"clip{suffix}", gray_frames(9), codec))
     assert (len(frames), frames.size, frames.frame_rate) == (9, SIZE, 12.5)
     np.testing.assert_allclose(frames.times, np.arange(9) / 12.5, atol=1e-9)
     for number, image in enumerate(frames):
@@ -54,7 +54,7 @@ def test_rotation_flag(tmp_path: Path, degrees: int, column: float, row: float) 
 @given(parts=st.lists(st.integers(1, 6), min_size=3, max_size=12))
 def test_variable_frame_rate(tmp_path_factory: pytest.TempPathFactory, parts: list[int]) -> None:
     path = tmp_path_factory.mktemp("vfr") / "clip.mp4"
-    set_durations(write_video(path, grey_frames(len(parts))), parts)
+    set_durations(write_video(path, gray_frames(len(parts))), parts)
     frames = VideoFrames(path)
     expected = np.cumsum([0, *parts[:-1]]) * len(parts) / sum(parts) / 12.5
     assert frames.times is not None
@@ -63,7 +63,7 @@ def test_variable_frame_rate(tmp_path_factory: pytest.TempPathFactory, parts: li
 
 
 def test_times_that_do_not_increase_are_not_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_video(tmp_path / "clip.mp4", grey_frames(5))
+    path = write_video(tmp_path / "clip.mp4", gray_frames(5))
 
     class Stuck:
         def __init__(self, capture: cv2.VideoCapture) -> None:
@@ -111,7 +111,7 @@ def test_backwards_is_the_same_as_forwards(
 
 
 def test_stop_ends_the_look_through(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "clip.mp4", grey_frames(9))
+    path = write_video(tmp_path / "clip.mp4", gray_frames(9))
     frames = VideoFrames(path, stop=4)
     assert len(frames) == 4
     assert frames.times is not None
@@ -200,7 +200,7 @@ def test_no_frames(tmp_path: Path) -> None:
 
 
 def test_video_that_disappears(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "clip.mp4", grey_frames(9))
+    path = write_video(tmp_path / "clip.mp4", gray_frames(9))
     frames = VideoFrames(path)
     assert frames[8].mean() > 100
     path.unlink()

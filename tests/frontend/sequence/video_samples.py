@@ -14,8 +14,8 @@ ROTATIONS = {0: (1, 0, 0, 1), 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -
 """Degrees clockwise from stored to upright, to a, b, c, d of a track header's matrix."""
 
 
-def grey_frames(length: int) -> list[np.ndarray]:
-    """Frames whose grey level is 20 times their number."""
+def gray_frames(length: int) -> list[np.ndarray]:
+    """Frames whose gray level is 20 times their number."""
     return [np.full((*SIZE, 3), 20 * i, np.uint8) for i in range(length)]
 
 

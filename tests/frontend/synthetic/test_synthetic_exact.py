@@ -67,9 +67,9 @@ def test_depth_lifts_static_pixels_onto_the_same_surface_in_every_frame(exact: S
     caster = RayCaster(scene.vertices(0.0), scene.triangles)
     in_frame = world_to_camera(truth.world_T_cam[5], world)
     projected = project(truth.intrinsics, in_frame)
-    centre = truth.world_T_cam[5][:3, 3]
-    hits = caster.cast(centre, world - centre)
-    surface = centre + hits.distance[:, None] * (world - centre)
+    center = truth.world_T_cam[5][:3, 3]
+    hits = caster.cast(center, world - center)
+    surface = center + hits.distance[:, None] * (world - center)
     gap = np.linalg.norm(surface - world, axis=-1)
     unoccluded = hits.distance > 1 - 1e-3
     assert unoccluded.mean() > 0.9
@@ -153,12 +153,12 @@ def test_static_tracks_rest_rigid_ones_keep_distances_and_deforming_ones_do_not(
         distance = np.linalg.norm(mine[:, None] - mine[None], axis=-1)
         return float(np.ptp(distance, axis=-1).max()), float(np.linalg.norm(np.ptp(mine, axis=1), axis=-1).min())
 
-    change, travelled = largest_change_of_distance(1)
+    change, traveled = largest_change_of_distance(1)
     assert change < 1e-12
-    assert travelled > 0.03
-    change, travelled = largest_change_of_distance(2)
+    assert traveled > 0.03
+    change, traveled = largest_change_of_distance(2)
     assert change > 0.04
-    assert travelled > 0.03
+    assert traveled > 0.03
 
 
 def test_true_object_poses_carry_the_tracks_of_rigid_instances_and_turn(exact: Simulation) -> None:
@@ -201,13 +201,13 @@ def test_lucas_kanade_follows_the_exact_tracks(exact: Simulation) -> None:
 
 def test_images_are_textured_and_brightness_is_nearly_constant(exact: Simulation) -> None:
     images = np.stack([exact.sequence.images[t] for t in range(6)]).astype(np.float64)
-    grey = images.mean(axis=-1)
-    assert 15 < np.abs(np.diff(grey, axis=2)).mean() + np.abs(np.diff(grey, axis=1)).mean() < 80
-    assert (grey > 250).mean() < 0.01
+    gray = images.mean(axis=-1)
+    assert 15 < np.abs(np.diff(gray, axis=2)).mean() + np.abs(np.diff(gray, axis=1)).mean() < 80
+    assert (gray > 250).mean() < 0.01
     tracks = exact.tracks
     kept = tracks.visible.all(axis=1)
     u, v = np.moveaxis(tracks.uv[kept], -1, 0)
-    value = np.stack([map_coordinates(grey[t], [v[:, t], u[:, t]], order=1) for t in range(6)], axis=1)
+    value = np.stack([map_coordinates(gray[t], [v[:, t], u[:, t]], order=1) for t in range(6)], axis=1)
     assert np.median(np.ptp(value, axis=1)) < 12
 
 

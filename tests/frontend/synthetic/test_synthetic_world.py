@@ -78,7 +78,7 @@ def test_too_many_objects_are_refused() -> None:
         make_scene("both", MAX_OBJECTS_PER_KIND + 1)
 
 
-def test_noise_is_normalised_periodic_and_detailed() -> None:
+def test_noise_is_normalized_periodic_and_detailed() -> None:
     volume = noise_volume()
     assert abs(float(volume.mean())) < 1e-4
     assert float(volume.std()) == pytest.approx(1.0, abs=1e-3)
@@ -97,7 +97,7 @@ def test_noise_is_normalised_periodic_and_detailed() -> None:
         {"objects": "many"},
         {"margin_px": 130.0},
         {"noise": {"outlier_min_px": 30}},
-        {"colour": 1},
+        {"color": 1},
     ],
 )
 def test_impossible_configurations_are_refused(fields: dict[str, object]) -> None:

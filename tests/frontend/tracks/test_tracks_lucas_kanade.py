@@ -26,7 +26,7 @@ Motion = Callable[[FloatArray, int], FloatArray]
 
 
 def texture(seed: int) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """A smooth random function of the plane with exact values at any position, grey levels around 128."""
+    """A smooth random function of the plane with exact values at any position, gray levels around 128."""
     rng = np.random.default_rng(seed)
     waves = 40
     wavelength = rng.uniform(9, 50, waves)
@@ -43,7 +43,7 @@ def texture(seed: int) -> Callable[[FloatArray, FloatArray], FloatArray]:
     return value
 
 
-def grey_levels(image: FloatArray) -> ImageArray:
+def gray_levels(image: FloatArray) -> ImageArray:
     return np.repeat(np.rint(image).astype(np.uint8)[..., None], 3, axis=-1)
 
 
@@ -57,7 +57,7 @@ def video(inverse: Motion, frames: int, seed: int = 0) -> ImageArray:
     images = []
     for t in range(frames):
         source = inverse(pixel_grid(), t)
-        images.append(grey_levels(plane(source[:, 0], source[:, 1]).reshape(HEIGHT, WIDTH)))
+        images.append(gray_levels(plane(source[:, 0], source[:, 1]).reshape(HEIGHT, WIDTH)))
     return np.stack(images)
 
 
@@ -88,12 +88,12 @@ def test_sub_pixel_shift(dx: float, dy: float, seed: int) -> None:
 
 
 def test_rotation_and_zoom() -> None:
-    centre = np.array([80.0, 60.0])
+    center = np.array([80.0, 60.0])
 
     def similarity(p: FloatArray, t: int) -> FloatArray:
         angle, scale = np.radians(1.0) * t, 1.01**t
         rotation = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return (p - centre) @ rotation.T + centre
+        return (p - center) @ rotation.T + center
 
     tracks = track_grid(ArrayFrames(video(lambda p, t: similarity(p, -t), 9)), COARSE)
     error = errors(tracks.uv, tracks.query_frame, similarity, lambda p, t: similarity(p, -t))
@@ -150,7 +150,7 @@ def occlusion_video(frames: int) -> tuple[ImageArray, Callable[[int], tuple[floa
     for t in range(frames):
         left, right = edges(t)
         inside = (x >= left) & (x <= right)
-        block = grey_levels(plane(x - left, y))
+        block = gray_levels(plane(x - left, y))
         images[t][inside] = block[inside]
     return images, edges
 
@@ -208,11 +208,11 @@ def test_too_short_tracks_are_left_out() -> None:
     assert (kept.visible.sum(axis=1) == 4).all()
 
 
-def test_grey_and_colour_images_give_the_same_tracks() -> None:
+def test_gray_and_color_images_give_the_same_tracks() -> None:
     _, back = shift((1.3, 0.2))
     images = video(back, 5)
-    colour, grey = track_grid(ArrayFrames(images), COARSE), track_grid(ArrayFrames(images[..., 0]), COARSE)
-    np.testing.assert_array_equal(colour.uv, grey.uv)
+    color, gray = track_grid(ArrayFrames(images), COARSE), track_grid(ArrayFrames(images[..., 0]), COARSE)
+    np.testing.assert_array_equal(color.uv, gray.uv)
 
 
 @pytest.mark.parametrize("size", [(2, 2), (8, 12), (24, 20)])
@@ -285,18 +285,18 @@ def test_real_video(data_root: Path) -> None:
     assert tracks.visible.sum(axis=1).mean() > 10
 
     # Lifted with the sensor's depth in the query frame, a point of the static scene projects to its track.
-    focal, centre = 525.0, np.array([319.5, 239.5])
+    focal, center = 525.0, np.array([319.5, 239.5])
     misses = []
     for q in (0, 10, 20):
         depth = cv2.imread(str(folder / "depth_gt" / f"{paths[q].stem}.png"), cv2.IMREAD_UNCHANGED) / 1000.0
         mine = np.flatnonzero(tracks.query_frame == q)
         u, v = np.rint(tracks.uv[mine, q]).astype(int).T
         z = depth[v, u]
-        ray = np.c_[(tracks.uv[mine, q] - centre) / focal, np.ones(len(mine))]
+        ray = np.c_[(tracks.uv[mine, q] - center) / focal, np.ones(len(mine))]
         world = (ray * z[:, None]) @ poses[q, :3, :3].T + poses[q, :3, 3]
         for t in range(max(q - 10, 0), min(q + 10, len(paths))):
             use = (z > 0.3) & tracks.visible[mine, t]
             camera = (world[use] - poses[t, :3, 3]) @ poses[t, :3, :3]
-            uv = camera[:, :2] / camera[:, 2:] * focal + centre
+            uv = camera[:, :2] / camera[:, 2:] * focal + center
             misses.append(np.linalg.norm(uv - tracks.uv[mine[use], t], axis=1))
     assert np.median(np.concatenate(misses)) < 1.2

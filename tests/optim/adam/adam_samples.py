@@ -96,8 +96,8 @@ def _random_data(name: str, family: FactorType, rng: np.random.Generator) -> np.
     if name == "measured":
         if family is aspect_prior:
             return rng.normal(scale=0.1, size=ROWS)
-        centre = K if family is intrinsics_prior else np.zeros(family.dim)
-        return centre + rng.normal(scale=0.5, size=(ROWS, family.dim))
+        center = K if family is intrinsics_prior else np.zeros(family.dim)
+        return center + rng.normal(scale=0.5, size=(ROWS, family.dim))
     if name in ("floor", "log_scale"):
         return np.full(ROWS, 1e-3)
     return rng.uniform(1.0, 4.0, size=ROWS)

@@ -57,7 +57,7 @@ def test_frozen_groups_give_the_same_energy(family: FactorType, rng: np.random.G
 
 @pytest.mark.parametrize("kernel", SMOOTH_KERNELS, ids=lambda kernel: kernel.kind)
 @pytest.mark.parametrize("family", FAMILIES, ids=FAMILY_IDS)
-def test_the_gradient_is_that_of_the_linearisation(
+def test_the_gradient_is_that_of_the_linearization(
     family: FactorType, kernel: Kernel, rng: np.random.Generator
 ) -> None:
     state = random_state(rng)
@@ -78,14 +78,14 @@ def test_the_gradient_is_that_of_the_linearisation(
         np.testing.assert_allclose(gradient[group.name], expected[group], rtol=1e-7, atol=1e-8 * scale + 1e-12)
 
 
-def body_frame_gradient(poses: np.ndarray, by_rotation: np.ndarray, by_centre: np.ndarray) -> np.ndarray:
-    """Chain gradients of rotation vector and centre to the twist of ``T Exp(xi)``."""
+def body_frame_gradient(poses: np.ndarray, by_rotation: np.ndarray, by_center: np.ndarray) -> np.ndarray:
+    """Chain gradients of rotation vector and center to the twist of ``T Exp(xi)``."""
     omega = se3.so3_log(poses[:, :3, :3])
     angle = np.linalg.norm(omega, axis=1)[:, None, None]
     w = se3.skew(omega)
     inverse_right = np.eye(3) + 0.5 * w + (1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))) * (w @ w)
     turn = np.einsum("nij,ni->nj", inverse_right, by_rotation)
-    shift = np.einsum("nij,ni->nj", poses[:, :3, :3], by_centre)
+    shift = np.einsum("nij,ni->nj", poses[:, :3, :3], by_center)
     return np.concatenate([turn, shift], axis=1)
 
 

@@ -73,7 +73,7 @@ def test_accuracy_and_times_of_the_whole_runs(comparison: Comparison) -> None:
     for run in comparison.runs.values():
         assert 0.0 < run.accuracy["ATE, m"] < 0.2
         assert 0.0 < run.accuracy["static AbsRel"] < 0.1
-        assert run.optimisation_seconds > 0.0
+        assert run.optimization_seconds > 0.0
     if comparison.preset == "default":
         # Not the points' own error: so short a path hardly determines the rotation that aligns them.
         assert comparison.runs["lm"].accuracy["moving AbsRel"] < 0.03

@@ -11,7 +11,7 @@ from uni4d_fg.results.run import Run
 
 @dataclass
 class Seen:
-    """Observations that agree with the result, ours: pixel centres at integers."""
+    """Observations that agree with the result, ours: pixel centers at integers."""
 
     landmark: np.ndarray
     frame: np.ndarray

@@ -21,7 +21,7 @@ Export = Callable[..., tuple[Path, object]]
 
 
 def rays(meta: dict[str, float], pose: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Directions (N, 3) of the rays of array positions, as nerfstudio documents them: through pixel centres."""
+    """Directions (N, 3) of the rays of array positions, as nerfstudio documents them: through pixel centers."""
     x = (column + 0.5 - meta["cx"]) / meta["fl_x"]
     y = -(row + 0.5 - meta["cy"]) / meta["fl_y"]
     directions = np.stack((x, y, -np.ones_like(x)), axis=-1) @ pose[:3, :3].T

@@ -71,7 +71,7 @@ def test_cameras_project_landmarks_to_the_pixels_that_saw_them(source: Run, reco
         mine = seen.frame == frame
         point = (result.landmarks[seen.landmark[mine]] - translations[frame][0]) @ matrix(rotations[frame][0])
         pixel = point @ pinhole.T
-        # rerun's pixel centres are at 0.5.
+        # rerun's pixel centers are at 0.5.
         error = np.linalg.norm(pixel[:, :2] / pixel[:, 2:] - (seen.uv[mine] + 0.5), axis=1)
         np.testing.assert_allclose(error, seen.error[mine], atol=1e-3)
 

@@ -177,7 +177,7 @@ def test_files_are_copied_only_if_others_see_the_same_pixels(source: Run, tmp_pa
     rgb = tmp_path / "rgb"
     rgb.mkdir()
     images = list(source.need_sequence().images)
-    variants = {1: images[1][:, :, :1], 2: images[2].astype(np.uint16) * 257}  # grey, 16 bits
+    variants = {1: images[1][:, :, :1], 2: images[2].astype(np.uint16) * 257}  # gray, 16 bits
     paths = []
     for frame, image in enumerate(images):
         paths.append(rgb / f"f{frame}.png")

@@ -43,7 +43,7 @@ def test_its_projection_meets_the_observations(source: Run, video: Path) -> None
     seen, landmarks = seen_landmarks(source), source.reconstruction.landmarks
     for frame in range(source.num_frames):
         file, mine = np.load(video / "uni4d" / "uni4d_fg" / f"{frame:04d}.npz"), seen.frame == frame
-        # x = K R^T (X - t), pixel centres at integers
+        # x = K R^T (X - t), pixel centers at integers
         pixel = (landmarks[seen.landmark[mine]] - file["t"]) @ file["R"] @ file["K"].T
         error = np.linalg.norm(pixel[:, :2] / pixel[:, 2:] - seen.uv[mine], axis=1)
         np.testing.assert_allclose(error, seen.error[mine], atol=1e-3)

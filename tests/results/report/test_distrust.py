@@ -88,7 +88,7 @@ def test_dropped_shares_and_scales_are_judged(run: Run) -> None:
     found = distrusted(with_stage(run, "tracks", tracks={"static": 10, "rejected": 30}), None)
     assert found[0].startswith("30 of 40 tracks were rejected")
     count = len(run.reconstruction.landmarks)
-    dropped = {"landmark far from its neighbours": count, "track without depth": 10 * count}
+    dropped = {"landmark far from its neighbors": count, "track without depth": 10 * count}
     [text] = distrusted(with_stage(run, "bundle_adjustment", dropped=dropped), None)
     assert text.startswith("50 % of the static landmarks")
     scales = np.resize([-0.3, 0.3], run.num_frames)

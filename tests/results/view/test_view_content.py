@@ -13,8 +13,8 @@ from viewing_samples import NUM_FRAMES, copied, opened
 from uni4d_fg.results.clouds import read_ply
 from uni4d_fg.results.colors import (
     BRIDGED_AMBER,
-    STATIC_GREY,
-    UNKNOWN_GREY,
+    STATIC_GRAY,
+    UNKNOWN_GRAY,
     instance_colors,
     value_colors,
     value_range,
@@ -78,7 +78,7 @@ def test_an_unreadable_configuration_does_not_hinder_clouds(finished_run: Path, 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 6), st.integers(1, 9), st.integers(0, 12), st.randoms(use_true_random=False))
-def test_trails_join_known_neighbours_up_to_the_frame(tracks: int, frames: int, length: int, random: object) -> None:
+def test_trails_join_known_neighbors_up_to_the_frame(tracks: int, frames: int, length: int, random: object) -> None:
     rng = np.random.default_rng(random.randrange(1 << 30))  # type: ignore[attr-defined]
     points = rng.normal(size=(tracks, frames, 3))
     points[rng.random((tracks, frames)) < 0.3] = np.nan
@@ -98,21 +98,21 @@ def test_trails_join_known_neighbours_up_to_the_frame(tracks: int, frames: int, 
     assert (shades[:, 0] < shades[:, 1]).all()
 
 
-def test_colours_by_value_and_instance() -> None:
+def test_colors_by_value_and_instance() -> None:
     low, high = value_range(np.array([0.0, 1.0, 2.0, np.nan, np.inf]))
     assert low == 0.0
     assert 1.0 < high <= 2.0
     assert value_range(np.array([np.nan])) == (0.0, 1.0)
     colors = value_colors(np.array([0.0, 5.0, np.inf, np.nan]), (0.0, 5.0))
     assert colors[1].tolist() == colors[2].tolist() != colors[0].tolist()
-    assert tuple(colors[3].tolist()) == UNKNOWN_GREY
+    assert tuple(colors[3].tolist()) == UNKNOWN_GRAY
     instances = instance_colors(np.array([0, 1, 2, 1], np.int32))
-    assert tuple(instances[0].tolist()) == STATIC_GREY
+    assert tuple(instances[0].tolist()) == STATIC_GRAY
     assert instances[1].tolist() == instances[3].tolist() != instances[2].tolist()
 
 
 @pytest.mark.parametrize("by", list(ColorBy))
-def test_every_colouring_covers_everything_and_says_what_it_means(finished_run: Path, by: ColorBy) -> None:
+def test_every_coloring_covers_everything_and_says_what_it_means(finished_run: Path, by: ColorBy) -> None:
     run = opened(finished_run)
     coloring = Coloring(by, run, values_of(run))
     assert coloring.landmarks().shape == run.reconstruction.landmark_color.shape
@@ -150,7 +150,7 @@ def test_thumbnails_are_not_wider_than_asked() -> None:
     assert thumbnail(np.zeros((10, 30, 3), np.uint8), 60).shape == (10, 30, 3)
 
 
-def test_thinning_keeps_points_with_their_colours() -> None:
+def test_thinning_keeps_points_with_their_colors() -> None:
     points = np.arange(300, dtype=np.float32).reshape(100, 3)
     cloud = ColoredPoints(points, points.astype(np.uint8), np.arange(100, dtype=np.int32)).thinned(10)
     assert len(cloud.points) == 10

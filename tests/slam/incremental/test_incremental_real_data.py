@@ -26,5 +26,5 @@ def test_the_error_is_at_most_one_and_a_half_times_that_of_the_batch(
     result, truth = solver.finish(), sequence.ground_truth.world_T_cam
     assert truth is not None
     assert ate(result.world_T_cam, truth) <= 1.5 * batch_ate_m
-    # The colour camera's focal length is about 525 px; 585 px are given.
+    # The color camera's focal length is about 525 px; 585 px are given.
     np.testing.assert_allclose(result.intrinsics[:2], 525.0, rtol=0.05)

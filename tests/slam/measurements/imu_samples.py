@@ -47,7 +47,7 @@ def ride(
 def seen_by_cameras(
     truth: Ride, scale: float, sigma_m: float, sigma_rad: float, dark: slice | None = None, seed: int = 0
 ) -> tuple[FloatArray, IntArray]:
-    """Noisy poses in units of ``scale`` metres; with a blackout, what follows stands somewhere else."""
+    """Noisy poses in units of ``scale`` meters; with a blackout, what follows stands somewhere else."""
     rng = np.random.default_rng(seed)
     count = len(truth.times)
     poses = truth.world_T_cam.copy()

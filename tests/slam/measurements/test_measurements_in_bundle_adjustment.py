@@ -63,7 +63,7 @@ def test_a_wrong_depth_scale_is_mended(tmp_path: Path, kind: str, backend: str) 
     stage = summary.stages["bundle_adjustment"]
     assert any("12 of 12 frames" in fact or "11 relative poses" in fact for fact in stage["facts"])
     assert summary.warnings == []
-    # Moving points follow the metre of the cameras.
+    # Moving points follow the meter of the cameras.
     points, poses = scene().ground_truth.track_points, truth(scene())
     assert points is not None
     expected = (points[found.dynamic_track] - poses[0, :3, 3]) @ poses[0, :3, :3]

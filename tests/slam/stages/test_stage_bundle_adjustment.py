@@ -164,7 +164,7 @@ def test_isolated_landmarks_are_dropped_and_counted(rng: np.random.Generator) ->
     points = static_points(rng, TRACKS)
     points[0] = [0.0, 0.0, 60.0]
     result = adjust(static_observations(observe(points, POSES)), POSES)
-    assert result.dropped["landmark far from its neighbours"] >= 1
+    assert result.dropped["landmark far from its neighbors"] >= 1
     assert 0 not in result.landmark_track
     assert len(result.landmarks) == len(result.landmark_track) == len(result.landmark_error)
     np.testing.assert_array_equal(np.unique(result.observations.track), result.landmark_track)

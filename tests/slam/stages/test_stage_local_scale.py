@@ -1,4 +1,4 @@
-"""The depth cue's scale at moving points: the neighbourhood is used exactly where it predicts better."""
+"""The depth cue's scale at moving points: the neighborhood is used exactly where it predicts better."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_white_noise_falls_back_to_the_scale_of_the_frame(rng: np.random.Generat
     assert local.sigma == local.frame_sigma == pytest.approx(0.02, rel=0.1)
 
 
-def test_no_neighbours_means_the_scale_of_the_frame(rng: np.random.Generator) -> None:
+def test_no_neighbors_means_the_scale_of_the_frame(rng: np.random.Generator) -> None:
     static, queries = scattered(rng, PER_FRAME), scattered(rng, 10)
     local = predict_log_scale(static, smooth_field(static), FRAME_SCALE, queries, 0, 512)
     np.testing.assert_array_equal(local.log_scale, FRAME_SCALE[queries.frame])

@@ -29,16 +29,16 @@ def changed(**fields: object) -> NonRigidConfig:
     return NonRigidConfig.model_validate(CONFIG.model_dump() | fields)
 
 
-def moving_patch(centre: tuple[float, float, float], speed: float = 0.03, side: int = 5) -> np.ndarray:
+def moving_patch(center: tuple[float, float, float], speed: float = 0.03, side: int = 5) -> np.ndarray:
     """A square patch of points, (side * side, T, 3), that moves steadily and turns slowly."""
     axis = np.linspace(-0.3, 0.3, side)
     x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
     time = np.arange(FRAMES)
     angle = 0.02 * time
     out = np.empty((side * side, FRAMES, 3))
-    out[..., 0] = centre[0] + np.outer(x, np.cos(angle)) + speed * time
-    out[..., 1] = centre[1] + y[:, None] + 0.0 * time
-    out[..., 2] = centre[2] + np.outer(x, np.sin(angle)) + 0.5 * speed * time
+    out[..., 0] = center[0] + np.outer(x, np.cos(angle)) + speed * time
+    out[..., 1] = center[1] + y[:, None] + 0.0 * time
+    out[..., 2] = center[2] + np.outer(x, np.sin(angle)) + 0.5 * speed * time
     return out
 
 
@@ -94,7 +94,7 @@ def test_gaps_within_a_track_exist_and_ends_do_not(exact: LabelledTracks) -> Non
     np.testing.assert_array_equal(mesh.row[3] >= 0, ~hidden[3])
 
 
-def test_observed_points_without_depth_start_between_their_neighbours(exact: LabelledTracks) -> None:
+def test_observed_points_without_depth_start_between_their_neighbors(exact: LabelledTracks) -> None:
     depth = exact.depth.copy()
     depth[7, [0, 4]] = np.nan
     mesh, points, _ = mesh_of(dataclasses.replace(exact, depth=depth))

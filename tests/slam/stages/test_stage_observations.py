@@ -1,4 +1,4 @@
-"""Flat observations of labelled tracks, and the weights of the paper's normalisations."""
+"""Flat observations of labelled tracks, and the weights of the paper's normalizations."""
 
 from __future__ import annotations
 

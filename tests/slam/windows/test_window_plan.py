@@ -26,7 +26,7 @@ SIZES = st.tuples(st.integers(2, 12), st.integers(0, 30), st.integers(2, 400))
 
 
 @given(SIZES)
-def test_windows_cover_the_video_and_neighbours_share_the_overlap(sizes: tuple[int, int, int]) -> None:
+def test_windows_cover_the_video_and_neighbors_share_the_overlap(sizes: tuple[int, int, int]) -> None:
     overlap, more, num_frames = sizes
     frames = 3 * overlap + more
     windows = plan_windows(num_frames, frames, overlap)

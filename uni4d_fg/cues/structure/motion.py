@@ -184,7 +184,7 @@ def _grow(scene: GrowingScene, num_frames: int, reporter: Reporter, should_stop:
 
 
 def _bridge(world_T_cam: FloatArray, registered: BoolArray) -> FloatArray:
-    """Give frames without a pose one between those of their neighbours; at the ends the nearest one."""
+    """Give frames without a pose one between those of their neighbors; at the ends the nearest one."""
     known = np.flatnonzero(registered)
     frame = np.clip(np.arange(len(registered)), known[0], known[-1])
     out = world_T_cam.copy()

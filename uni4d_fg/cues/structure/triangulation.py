@@ -72,13 +72,13 @@ def triangulate(rays: RayBundle, huber_px: float) -> Points:
         rays: What the frames see.
         huber_px: Reprojection errors above this count less, px.
     """
-    centre = rays.world_T_cam[:, :3, 3]
+    center = rays.world_T_cam[:, :3, 3]
     in_camera: FloatArray = unproject(rays.intrinsics, rays.uv, np.ones(len(rays.uv)))
     direction = np.einsum("nij,nj->ni", rays.world_T_cam[:, :3, :3], in_camera)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     matrix = _sum_rows(across, rays.row, rays.count)
-    right = _sum_rows(np.einsum("nij,nj->ni", across, centre), rays.row, rays.count)
+    right = _sum_rows(np.einsum("nij,nj->ni", across, center), rays.row, rays.count)
     # Parallel rays leave one direction open: the smallest eigenvalue is about (angle)^2 / 2.
     solvable = np.linalg.eigvalsh(matrix)[:, 0] > _RIDGE
     position = np.full((rays.count, 3), np.nan)

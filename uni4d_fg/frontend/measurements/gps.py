@@ -7,7 +7,7 @@ Columns: ``timestamp`` [s] and either ``x, y, z`` [m] in axes of any map, or ``l
     N = a / sqrt(1 - e^2 sin^2 phi)
     X = ((N + h) cos phi cos lambda, (N + h) cos phi sin lambda, (N (1 - e^2) + h) sin phi)
 
-are the Earth-centred coordinates of latitude phi, longitude lambda and height h, on the ellipsoid a, e of WGS84; their
+are the Earth-centered coordinates of latitude phi, longitude lambda and height h, on the ellipsoid a, e of WGS84; their
 difference to the origin's is turned to the axes of its east, north and up.
 Source: NGA.STND.0036, "World Geodetic System 1984"; Hofmann-Wellenhof et al. 2008, "GNSS", chapter 8.
 """
@@ -103,7 +103,7 @@ def east_north_up(position: FloatArray, origin: FloatArray) -> FloatArray:
 
 
 def earth_centered(position: FloatArray) -> FloatArray:
-    """Return latitude, longitude [degrees] and altitude [m] (N, 3) as Earth-centred, Earth-fixed (N, 3) m."""
+    """Return latitude, longitude [degrees] and altitude [m] (N, 3) as Earth-centered, Earth-fixed (N, 3) m."""
     latitude, longitude = np.radians(position[:, 0]), np.radians(position[:, 1])
     squared = _FLATTENING * (2.0 - _FLATTENING)
     normal = _AXIS_M / np.sqrt(1.0 - squared * np.sin(latitude) ** 2)

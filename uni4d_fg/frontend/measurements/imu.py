@@ -102,7 +102,7 @@ class ImuSamples:
         rotation = self.body_T_cam[:3, :3]
         rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0
         if not rigid or np.abs(self.body_T_cam[3] - [0, 0, 0, 1]).max() > _MAX_ROTATION_ERROR:
-            raise InputError("IMU: body_T_cam is no rigid transform (4 x 4, rotation and translation in metres)")
+            raise InputError("IMU: body_T_cam is no rigid transform (4 x 4, rotation and translation in meters)")
 
     def __len__(self) -> int:
         return len(self.timestamps)

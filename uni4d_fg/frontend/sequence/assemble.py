@@ -41,11 +41,11 @@ def sampled(paths: tuple[Path, ...]) -> list[Path]:
     return list(dict.fromkeys((paths[0], paths[len(paths) // 2], paths[-1])))
 
 
-def open_depth(path: Path, size: tuple[int, int] | None, units_per_metre: float = 1000.0) -> DepthFolder | NpyDepth:
+def open_depth(path: Path, size: tuple[int, int] | None, units_per_meter: float = 1000.0) -> DepthFolder | NpyDepth:
     """Open a folder of depth maps or one ``.npy`` file of images of ``size``. Raises InputError."""
     if not path.is_dir():
         return NpyDepth(path, size)
-    return DepthFolder(list_frames(path, DEPTH_SUFFIXES), size, units_per_metre)
+    return DepthFolder(list_frames(path, DEPTH_SUFFIXES), size, units_per_meter)
 
 
 def open_masks(path: Path, size: tuple[int, int] | None) -> MaskFolder:
@@ -226,7 +226,7 @@ def _assemble_truth(
 ) -> GroundTruth:
     depths = None
     if files.true_depth is not None:
-        depths = open_depth(files.true_depth, size, files.true_depth_units_per_metre)
+        depths = open_depth(files.true_depth, size, files.true_depth_units_per_meter)
         check_count(files.true_depth, len(depths), num_frames)
         depths[0]
     truth = GroundTruth()

@@ -11,7 +11,7 @@ from uni4d_fg.files import load_npy
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 
 MAX_VARIATION = 0.01
-"""Per-frame matrices must agree to this part of the focal length (and of the image size, for the centre)."""
+"""Per-frame matrices must agree to this part of the focal length (and of the image size, for the center)."""
 MAX_SKEW = 1e-3
 """Largest skew, as a part of the focal length, that is taken for zero."""
 
@@ -21,7 +21,7 @@ class VaryingIntrinsics(SequenceProblem):
 
 
 def guess_intrinsics(size: tuple[int, int]) -> FloatArray:
-    """Return (4,) fx, fy, cx, cy, px: focal length of the longer side, principal point in the centre."""
+    """Return (4,) fx, fy, cx, cy, px: focal length of the longer side, principal point in the center."""
     height, width = size
     focal = float(max(size))
     return np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
@@ -70,7 +70,7 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
         raise SequenceProblem(path, "is not a pinhole matrix", "save [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
     skew = np.abs(matrices[:, 0, 1]).max()
     if skew > MAX_SKEW * focal.min():
-        raise SequenceProblem(path, f"has a skew of {skew:g} px", "rectify the images; skew is not modelled")
+        raise SequenceProblem(path, f"has a skew of {skew:g} px", "rectify the images; skew is not modeled")
     per_frame = np.concatenate((focal, matrices[:, :2, 2]), axis=1)
     mean: FloatArray = per_frame.mean(axis=0)
     variation = np.abs(per_frame - mean) / np.array([mean[0], mean[1], max(size), max(size)])
@@ -91,7 +91,7 @@ def implausible(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
     if not (0 <= cx < width and 0 <= cy < height):
         return f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px"
     if abs(cx - (width - 1) / 2) > 0.25 * width or abs(cy - (height - 1) / 2) > 0.25 * height:
-        return f"principal point ({cx:.1f}, {cy:.1f}) is far from the centre of the {width} x {height} px image"
+        return f"principal point ({cx:.1f}, {cy:.1f}) is far from the center of the {width} x {height} px image"
     if not 0.2 * width < fx < 10 * width:
         return f"focal length {fx:.1f} px is unusual for an image {width} px wide"
     if not 0.8 < fx / fy < 1.25:

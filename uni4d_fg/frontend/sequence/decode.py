@@ -32,7 +32,7 @@ _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 
 def _cut_short(data: bytes) -> bool:
-    """Tell whether a PNG or JPEG lacks its end; some decoders fill the rest with grey and say nothing."""
+    """Tell whether a PNG or JPEG lacks its end; some decoders fill the rest with gray and say nothing."""
     if data.startswith(_PNG_SIGNATURE):
         return b"IEND" not in data[-1024:]
     if data.startswith(_JPEG_START):
@@ -74,9 +74,9 @@ def _check_pixels(path: Path, data: bytes) -> None:
 
 
 def read_image(path: Path) -> ImageArray:
-    """Read a colour image, upright.
+    """Read a color image, upright.
 
-    Grey images become RGB, 16-bit images are scaled to 8 bits, alpha is dropped, and an EXIF orientation is
+    Gray images become RGB, 16-bit images are scaled to 8 bits, alpha is dropped, and an EXIF orientation is
     applied, as every viewer does.
 
     Returns:
@@ -130,23 +130,23 @@ def is_16_bit_png(path: Path) -> bool:
 
 
 def clean_depth(depth: npt.NDArray[Any]) -> Float32Array:
-    """Return a float32 copy of a depth map (metres) in which zero, negative and infinite values are NaN."""
+    """Return a float32 copy of a depth map (meters) in which zero, negative and infinite values are NaN."""
     with np.errstate(over="ignore", invalid="ignore"):
         cleaned: Float32Array = depth.astype(np.float32)
         cleaned[~(np.isfinite(cleaned) & (cleaned > 0))] = np.nan
     return cleaned
 
 
-def read_depth(path: Path, units_per_metre: float = 1000.0) -> Float32Array:
+def read_depth(path: Path, units_per_meter: float = 1000.0) -> Float32Array:
     """Read a depth map from a 16-bit PNG or a ``.npy`` file.
 
     Args:
-        path: A PNG whose values divided by ``units_per_metre`` are metres (0 and 65535 mean missing), or a
-            ``.npy`` file of shape (H, W) or (1, H, W) in metres.
-        units_per_metre: 1000 for millimetres, 256 for KITTI, 5000 for TUM and Bonn.
+        path: A PNG whose values divided by ``units_per_meter`` are meters (0 and 65535 mean missing), or a
+            ``.npy`` file of shape (H, W) or (1, H, W) in meters.
+        units_per_meter: 1000 for millimeters, 256 for KITTI, 5000 for TUM and Bonn.
 
     Returns:
-        (H, W) float32 metres, NaN where missing.
+        (H, W) float32 meters, NaN where missing.
 
     Raises:
         InputError: If the file cannot be read or is not a depth map.
@@ -157,7 +157,7 @@ def read_depth(path: Path, units_per_metre: float = 1000.0) -> Float32Array:
             values = values[0]
         if values.ndim != 2 or values.dtype.kind != "f":
             raise SequenceProblem(
-                path, f"has shape {values.shape} of {values.dtype}", "save it as (H, W) floats in metres"
+                path, f"has shape {values.shape} of {values.dtype}", "save it as (H, W) floats in meters"
             )
         return clean_depth(values)
     pixels = _decode(path)
@@ -166,9 +166,9 @@ def read_depth(path: Path, units_per_metre: float = 1000.0) -> Float32Array:
         raise SequenceProblem(
             path,
             f"has {channels} channel(s) of {pixels.dtype}, not one of 16 bits: a picture of depth is not depth",
-            "save depth as 16-bit PNG in millimetres",
+            "save depth as 16-bit PNG in millimeters",
         )
-    depth = clean_depth(pixels / np.float32(units_per_metre))
+    depth = clean_depth(pixels / np.float32(units_per_meter))
     depth[pixels == SATURATED] = np.nan
     return depth
 

@@ -13,20 +13,20 @@ from uni4d_fg.errors import InputError
 _MAX_ID = np.iinfo(np.int32).max
 
 
-def checked_image(image: Any, size: tuple[int, int], where: str, *, grey: bool = False) -> ImageArray:
+def checked_image(image: Any, size: tuple[int, int], where: str, *, gray: bool = False) -> ImageArray:
     """Return an image as an array.
 
     Args:
-        image: (H, W, 3) uint8 RGB; with ``grey`` also (H, W).
+        image: (H, W, 3) uint8 RGB; with ``gray`` also (H, W).
         size: (height, width) that it must have, px.
         where: What to call it in messages.
-        grey: Whether one channel will do.
+        gray: Whether one channel will do.
 
     Raises:
         InputError: If it is not of that form.
     """
     array = _array(image, where)
-    shapes = [(*size, 3), size] if grey else [(*size, 3)]
+    shapes = [(*size, 3), size] if gray else [(*size, 3)]
     if array.shape not in shapes:
         expected = " or ".join(map(str, shapes))
         raise InputError(f"{where} has shape {array.shape}, but {expected} is expected; the video is {size}")
@@ -36,14 +36,14 @@ def checked_image(image: Any, size: tuple[int, int], where: str, *, grey: bool =
 
 
 def checked_depth(depth: Any, size: tuple[int, int], where: str) -> Float32Array:
-    """Return a depth map in metres as a new array of float32 in which all that is not positive and finite is NaN.
+    """Return a depth map in meters as a new array of float32 in which all that is not positive and finite is NaN.
 
     Raises:
         InputError: If it is not (H, W) numbers.
     """
     array = _of_size(depth, size, where)
     if array.dtype.kind not in "iuf":
-        raise InputError(f"{where} has dtype {array.dtype}; give metres as floats")
+        raise InputError(f"{where} has dtype {array.dtype}; give meters as floats")
     with np.errstate(over="ignore", invalid="ignore"):
         cleaned: Float32Array = array.astype(np.float32)
         cleaned[~((cleaned > 0) & np.isfinite(cleaned))] = np.nan
@@ -54,7 +54,7 @@ def floating_depth(depth: Any, size: tuple[int, int], where: str) -> npt.NDArray
     """Return a depth map as it is. Raises InputError if it is not (H, W) floats: whole numbers have no unit."""
     array = _of_size(depth, size, where)
     if array.dtype.kind != "f":
-        raise InputError(f"{where} has dtype {array.dtype}; give metres as floats")
+        raise InputError(f"{where} has dtype {array.dtype}; give meters as floats")
     return array
 
 

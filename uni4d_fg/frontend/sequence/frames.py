@@ -102,29 +102,29 @@ class MaskFolder(FileFrames[Int32Array]):
 
 
 class DepthFolder(FileFrames[Float32Array]):
-    """T depth files (16-bit PNG, or ``.npy`` in metres) as (H, W) float32 metres, NaN where missing.
+    """T depth files (16-bit PNG, or ``.npy`` in meters) as (H, W) float32 meters, NaN where missing.
 
     Args:
         paths: T files.
         size: Expected (height, width); None takes the first file's.
-        units_per_metre: Divisor that turns PNG values into metres.
+        units_per_meter: Divisor that turns PNG values into meters.
     """
 
     def __init__(
-        self, paths: tuple[Path, ...], size: tuple[int, int] | None = None, units_per_metre: float = 1000.0
+        self, paths: tuple[Path, ...], size: tuple[int, int] | None = None, units_per_meter: float = 1000.0
     ) -> None:
-        self.units_per_metre = units_per_metre
+        self.units_per_meter = units_per_meter
         super().__init__(paths, size)
 
     def _decode(self, path: Path) -> Float32Array:
-        return read_depth(path, self.units_per_metre)
+        return read_depth(path, self.units_per_meter)
 
 
 class NpyDepth(LazyFrames[Float32Array]):
     """Depth maps of one ``.npy`` file, mapped into memory only while a frame is copied out of it.
 
     Args:
-        path: File of (T, H, W) or (T, 1, H, W) floats in metres.
+        path: File of (T, H, W) or (T, 1, H, W) floats in meters.
         size: Expected (height, width); None accepts any.
 
     Attributes:
@@ -142,7 +142,7 @@ class NpyDepth(LazyFrames[Float32Array]):
             raise SequenceProblem(path, f"has shape {values.shape}", "save depth as (T, H, W) or (T, 1, H, W)")
         if values.dtype.kind != "f":
             raise SequenceProblem(
-                path, f"holds {values.dtype} values of unknown unit", "save depth as floats in metres"
+                path, f"holds {values.dtype} values of unknown unit", "save depth as floats in meters"
             )
         self.size = (int(values.shape[-2]), int(values.shape[-1]))
         self._length = int(values.shape[0])

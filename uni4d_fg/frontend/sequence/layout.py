@@ -32,7 +32,7 @@ class LayoutOptions(TypedDict, total=False):
     tracks: str | None
     """Track folder (Uni4D's layout only)."""
     depth_gt_scale: float
-    """Units per metre of PNGs in ``depth_gt/`` (Uni4D's layout only; native is millimetres). 1000 by default."""
+    """Units per meter of PNGs in ``depth_gt/`` (Uni4D's layout only; native is millimeters). 1000 by default."""
     known_intrinsics: bool
     """Take ``K.npy`` instead of the estimate (Uni4D's layout; native always does). False by default."""
 
@@ -54,7 +54,7 @@ class SequenceFiles:
     initial_poses: Path | None = None
     true_poses: Path | None = None
     true_depth: Path | None = None
-    true_depth_units_per_metre: float = 1000.0
+    true_depth_units_per_meter: float = 1000.0
     true_intrinsics: Path | None = None
     ground_truth: Path | None = None
     problems: tuple[SequenceProblem, ...] = ()

@@ -48,17 +48,17 @@ class GroundTruth:
     """What is known of the truth; every field may be absent. Used by evaluation only, never by the solver."""
 
     world_T_cam: FloatArray | None = None
-    """(T, 4, 4) camera to world, OpenCV axes, metres."""
+    """(T, 4, 4) camera to world, OpenCV axes, meters."""
     depths: FrameSource[Float32Array] | None = None
-    """T maps (H, W), metres; NaN where unknown."""
+    """T maps (H, W), meters; NaN where unknown."""
     intrinsics: FloatArray | None = None
     """(4,) fx, fy, cx, cy, px."""
     track_points: FloatArray | None = None
-    """(K, T, 3) world position of each of the sequence's own tracks, metres; NaN where unknown."""
+    """(K, T, 3) world position of each of the sequence's own tracks, meters; NaN where unknown."""
     rigid_instance: Int32Array | None = None
     """(J,) mask ids of the instances that move rigidly."""
     world_T_object: FloatArray | None = None
-    """(J, T, 4, 4) their poses, metres; the origin and axes of an object's frame are arbitrary, but fixed to it."""
+    """(J, T, 4, 4) their poses, meters; the origin and axes of an object's frame are arbitrary, but fixed to it."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Video:
     timestamps: FloatArray
     """(T,) seconds, strictly increasing; frame index when unknown."""
     depths: FrameSource[Float32Array] | None = None
-    """T maps (H, W), float32 metres, NaN where missing."""
+    """T maps (H, W), float32 meters, NaN where missing."""
     masks: FrameSource[Int32Array] | None = None
     """T label maps (H, W), int32."""
     intrinsics: FloatArray | None = None
@@ -102,7 +102,7 @@ class Video:
 class Sequence:
     """One video with all its cues.
 
-    Conventions: pixel centres at integers; depth is z-depth in metres, NaN where missing (readers turn
+    Conventions: pixel centers at integers; depth is z-depth in meters, NaN where missing (readers turn
     zero, negative and infinite values into NaN); mask 0 is static and > 0 an instance that may move.
     """
 
@@ -110,7 +110,7 @@ class Sequence:
     images: FrameSource[ImageArray]
     """T images (H, W, 3), uint8 RGB."""
     depths: FrameSource[Float32Array]
-    """T maps (H, W), float32 metres, NaN where missing."""
+    """T maps (H, W), float32 meters, NaN where missing."""
     masks: FrameSource[Int32Array]
     """T label maps (H, W), int32."""
     intrinsics: FloatArray

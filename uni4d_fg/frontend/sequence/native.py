@@ -39,7 +39,7 @@ def find_native_files(root: Path, depth: str | None = None) -> SequenceFiles:
 
     Args:
         root: The sequence folder.
-        depth: Name of the depth cue: a folder of 16-bit PNGs in millimetres, or a ``.npy`` file in metres;
+        depth: Name of the depth cue: a folder of 16-bit PNGs in millimeters, or a ``.npy`` file in meters;
             None takes ``depth_cue`` or ``depth.npy`` if it is there.
 
     Returns:
@@ -94,8 +94,8 @@ def read_native(root: Path, depth: str | None = None) -> Sequence:
     ``rgb/``                    one PNG or JPEG per frame, in the order of their names; without the folder
                                 ``video.mp4`` (``.mov``, ``.mkv``, ...), or the images themselves
     ``K.npy``                   (3, 3) or (T, 3, 3), px; guessed from the image size when absent
-    ``depth_cue/``              one 16-bit PNG per frame, millimetres, 0 = missing; or ``depth_cue.npy`` or
-                                ``depth.npy``, (T, H, W) or (T, 1, H, W), metres
+    ``depth_cue/``              one 16-bit PNG per frame, millimeters, 0 = missing; or ``depth_cue.npy`` or
+                                ``depth.npy``, (T, H, W) or (T, 1, H, W), meters
     ``masks/``                  one PNG of ids per frame; without the folder everything is static
     ``tracks.npz``              optional: uv (K, T, 2), visible (K, T), query_frame (K,), confidence (K, T)
     ``timestamps.txt``          optional: seconds, one per line

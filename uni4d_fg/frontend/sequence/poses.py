@@ -22,7 +22,7 @@ def load_poses(path: Path, num_frames: int) -> FloatArray:
     A bottom row of zeros, as some programs write, is repaired; rounding of the rotations is removed.
 
     Args:
-        path: ``.npy`` file of (T, 4, 4), camera to world, OpenCV axes, metres.
+        path: ``.npy`` file of (T, 4, 4), camera to world, OpenCV axes, meters.
         num_frames: T.
 
     Returns:

@@ -1,6 +1,6 @@
 """A video made smaller, with everything that is measured in its pixels.
 
-Pixel centres are at integers, so that the image reaches from -0.5 to W - 0.5. A pixel ``u`` of the full image
+Pixel centers are at integers, so that the image reaches from -0.5 to W - 0.5. A pixel ``u`` of the full image
 lies at ``(u + 0.5) s - 0.5`` of the small one, where ``s`` is the ratio of the widths (of the heights for v).
 """
 
@@ -47,7 +47,7 @@ def resize_image(image: ImageArray, size: tuple[int, int]) -> ImageArray:
 
 
 def resize_nearest(array: T, size: tuple[int, int]) -> T:
-    """Return a map (H, W) at another ``size`` (height, width): each pixel the one nearest to its centre."""
+    """Return a map (H, W) at another ``size`` (height, width): each pixel the one nearest to its center."""
     rows, columns = (
         np.floor((np.arange(new) + 0.5) * (old / new)).astype(np.int64)
         for old, new in zip(array.shape[:2], size, strict=True)
@@ -115,7 +115,7 @@ def resize_video(video: Video, max_size: int) -> Video:
 def resize_tracks(tracks: Tracks, size: tuple[int, int], new_size: tuple[int, int]) -> Tracks:
     """Return tracks of images of ``size`` (height, width) for images of ``new_size``.
 
-    An observation that comes to lie outside the pixel centres by rounding stays visible.
+    An observation that comes to lie outside the pixel centers by rounding stays visible.
     """
     scale = np.array([new_size[1] / size[1], new_size[0] / size[0]])
     uv = ((tracks.uv + 0.5) * scale - 0.5).astype(np.float32)

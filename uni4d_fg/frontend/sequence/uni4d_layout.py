@@ -92,7 +92,7 @@ def find_uni4d_files(
     """
     check_root(root)
     if not depth_gt_scale > 0:
-        raise SequenceProblem(root, f"depth_gt_scale {depth_gt_scale} is not positive", "give units per metre")
+        raise SequenceProblem(root, f"depth_gt_scale {depth_gt_scale} is not positive", "give units per meter")
     problems: list[SequenceProblem] = []
     images = find_images(root)
     if images is None:
@@ -118,7 +118,7 @@ def find_uni4d_files(
         tracks=None if track_folder is None else _track_file(track_folder),
         true_poses=existing(root / "c2w.npy"),
         true_depth=existing(root / "depth_gt"),
-        true_depth_units_per_metre=depth_gt_scale,
+        true_depth_units_per_meter=depth_gt_scale,
         true_intrinsics=known,
         problems=tuple(problems),
         no_depth=SequenceProblem(root, "has no depth: no folder holds depth.npy", "run the depth preprocessing first")
@@ -132,19 +132,19 @@ def read_uni4d(root: Path, **options: Unpack[LayoutOptions]) -> Sequence:
 
     =====================================  ================================================================
     ``rgb/``                               one PNG or JPEG per frame, in the order of their names
-    ``unidepth/depth.npy``                 (T, 1, H, W), metres; any folder with a ``depth.npy``
+    ``unidepth/depth.npy``                 (T, 1, H, W), meters; any folder with a ``depth.npy``
     ``unidepth/intrinsics.npy``            (3, 3) or (T, 3, 3) estimated intrinsics, px, principal point included
     ``deva/Annotations/``                  optional: RGB PNGs, id = R + 256 G + 65536 B; any ``*/Annotations/``
     ``cotrackerv3_10_50/results.npz``      optional tracks; ``filtered_results.npz`` when only that is there
     ``K.npy``                              optional: known intrinsics; used as truth and, on request, as input
     ``c2w.npy``                            optional truth: (T, 4, 4); a zero bottom row is repaired
-    ``depth_gt/``                          optional truth: ``.npy`` in metres or 16-bit PNG
+    ``depth_gt/``                          optional truth: ``.npy`` in meters or 16-bit PNG
     =====================================  ================================================================
 
     Args:
         root: The sequence folder.
         **options: ``depth``, ``masks``, ``tracks``: names of folders; None takes the only one there is.
-            ``depth_gt_scale``: units per metre of true depth in PNGs: 1000, or 256 for KITTI, 5000 for TUM and
+            ``depth_gt_scale``: units per meter of true depth in PNGs: 1000, or 256 for KITTI, 5000 for TUM and
             Bonn. ``known_intrinsics``: take ``K.npy`` instead of the depth network's estimate.
 
     Returns:

@@ -31,7 +31,7 @@ MOSTLY_MISSING = 0.5
 MAX_TIME_RATIO = 1.5
 """Ratio of the longest to the shortest time between frames that is taken for a constant frame rate."""
 PLAUSIBLE_DEPTH = (0.05, 200.0)
-"""Range in metres in which a frame's median depth is expected."""
+"""Range in meters in which a frame's median depth is expected."""
 
 
 def validate_sequence(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOptions]) -> ValidationReport:
@@ -91,7 +91,7 @@ class _Validation:
         if files.true_poses is not None:
             self._array("true poses", lambda path: load_poses(path, num_frames), files.true_poses)
         if files.true_depth is not None:
-            self._depth("true depth", files.true_depth, files.true_depth_units_per_metre)
+            self._depth("true depth", files.true_depth, files.true_depth_units_per_meter)
         self._other_truth(num_frames, size)
 
     def _images(self, path: Path) -> None:
@@ -148,8 +148,8 @@ class _Validation:
                 "none",
             )
 
-    def _depth(self, item: str, path: Path, units_per_metre: float) -> None:
-        frames = self.findings.attempt(item, lambda: assemble.open_depth(path, self.size, units_per_metre))
+    def _depth(self, item: str, path: Path, units_per_meter: float) -> None:
+        frames = self.findings.attempt(item, lambda: assemble.open_depth(path, self.size, units_per_meter))
         if frames is None:
             return
         self._pairing(item, path, frames)
@@ -173,7 +173,7 @@ class _Validation:
                 "warning",
                 item,
                 f"{path}: all depth is missing in frame(s) {some_of(empty)}",
-                "replace these depth maps; the frames are tied by their neighbours only",
+                "replace these depth maps; the frames are tied by their neighbors only",
             )
         if odd:
             self.findings.add(
@@ -181,7 +181,7 @@ class _Validation:
                 item,
                 f"{path}: the median depth is outside {PLAUSIBLE_DEPTH[0]} to {PLAUSIBLE_DEPTH[1]:g} m "
                 f"in frame(s) {some_of(odd)}",
-                "check the unit: PNGs are in millimetres, .npy in metres",
+                "check the unit: PNGs are in millimeters, .npy in meters",
             )
         if len(empty) < len(missing) and np.mean(missing) > MOSTLY_MISSING:
             self.findings.add(

@@ -19,14 +19,14 @@ from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
 from uni4d_fg.frontend.track_model import Tracks
 
 MAX_PNG_DEPTH = 65.0
-"""Depth in metres from which on 16-bit millimetres do not reach."""
+"""Depth in meters from which on 16-bit millimeters do not reach."""
 MAX_RGB_ID = 256**3 - 1
 
 
 def write_native(sequence: Sequence, root: Path) -> None:
     """Write a sequence with all it holds in the native layout.
 
-    Images become PNG. Depth becomes 16-bit PNG in millimetres (rounded, missing = 0), or one ``.npy`` file
+    Images become PNG. Depth becomes 16-bit PNG in millimeters (rounded, missing = 0), or one ``.npy`` file
     when it reaches 65 m. Files are named after the frames where that keeps their order, else by number.
 
     Args:
@@ -144,7 +144,7 @@ def _write_masks(masks: FrameSource[Int32Array], folder: Path, names: Iterable[s
 
 
 def _farthest(depths: FrameSource[Float32Array]) -> float:
-    """Return the largest depth of a video, metres; 0 if all is missing."""
+    """Return the largest depth of a video, meters; 0 if all is missing."""
     return max((float(np.nanmax(d, initial=0.0)) for d in map(clean_depth, depths)), default=0.0)
 
 
@@ -156,8 +156,8 @@ def _write_depth(depths: FrameSource[Float32Array], folder: Path, names: tuple[s
         return
     folder.mkdir(parents=True)
     for name, depth in zip(names, depths, strict=True):
-        millimetres = np.rint(np.nan_to_num(clean_depth(depth), nan=0.0) * np.float32(1000.0))
-        _write_png(folder / f"{name}.png", millimetres.astype(np.uint16))
+        millimeters = np.rint(np.nan_to_num(clean_depth(depth), nan=0.0) * np.float32(1000.0))
+        _write_png(folder / f"{name}.png", millimeters.astype(np.uint16))
 
 
 def _write_depth_array(depths: FrameSource[Float32Array], path: Path, shape: tuple[int, ...], missing: float) -> None:

@@ -17,8 +17,8 @@ def look_at(position: FloatArray, target: FloatArray, roll: FloatArray) -> Float
     """Point cameras at targets, with the world's y axis (down) close to the image's.
 
     Args:
-        position: (T, 3) camera centres, metres.
-        target: (T, 3) points on the optical axes, metres.
+        position: (T, 3) camera centers, meters.
+        target: (T, 3) points on the optical axes, meters.
         roll: (T,) rotation about the optical axis, rad.
 
     Returns:
@@ -38,7 +38,7 @@ def look_at(position: FloatArray, target: FloatArray, roll: FloatArray) -> Float
 
 
 def _curve(parameter: FloatArray) -> FloatArray:
-    """Return (N, 3) positions on a closed curve about 1 m wide in front of the objects, metres."""
+    """Return (N, 3) positions on a closed curve about 1 m wide in front of the objects, meters."""
     x = 0.42 * np.sin(parameter - 0.9)
     y = 0.12 * np.sin(2.0 * parameter + 0.4)
     z = 0.2 * np.cos(1.0 * parameter + 0.3)
@@ -46,11 +46,11 @@ def _curve(parameter: FloatArray) -> FloatArray:
 
 
 def _positions_at(distance: FloatArray) -> FloatArray:
-    """Return (T, 3) positions after travelling ``distance`` metres along the closed curve."""
+    """Return (T, 3) positions after traveling ``distance`` meters along the closed curve."""
     parameter = np.linspace(0.0, 2.0 * np.pi, 8001)
     step = np.linalg.norm(np.diff(_curve(parameter), axis=0), axis=-1)
-    travelled = np.concatenate(([0.0], np.cumsum(step)))
-    return _curve(np.interp(distance % travelled[-1], travelled, parameter))
+    traveled = np.concatenate(([0.0], np.cumsum(step)))
+    return _curve(np.interp(distance % traveled[-1], traveled, parameter))
 
 
 def _tremor(time: FloatArray, amplitude: float, phase: float) -> FloatArray:
@@ -67,13 +67,13 @@ def camera_path(kind: PathKind, timestamps: FloatArray, speed: float) -> FloatAr
 
     Args:
         kind: ``"handheld"`` travels on a closed curve, looking at the room's middle, with a slight tremor;
-            ``"static"`` rests; ``"rotation"`` turns about a fixed centre; ``"forward"`` moves along its fixed
+            ``"static"`` rests; ``"rotation"`` turns about a fixed center; ``"forward"`` moves along its fixed
             optical axis (and after a while back).
         timestamps: (T,) seconds.
-        speed: Metres per second along the path; ``"rotation"`` turns at ``speed`` times 0.4 rad/m at most.
+        speed: Meters per second along the path; ``"rotation"`` turns at ``speed`` times 0.4 rad/m at most.
 
     Returns:
-        (T, 4, 4) camera to world, OpenCV axes, metres. Frame 0 is not the identity.
+        (T, 4, 4) camera to world, OpenCV axes, meters. Frame 0 is not the identity.
     """
     num_frames = len(timestamps)
     still = np.zeros(num_frames)

@@ -6,7 +6,7 @@ from uni4d_fg.frontend.synthetic.mesh import Mesh, box, box_faces, concatenate, 
 from uni4d_fg.frontend.synthetic.texture import SurfaceStyle
 
 ROOM_SIZE_M = (5.0, 3.0, 5.0)
-"""Width, height and depth of the room, metres."""
+"""Width, height and depth of the room, meters."""
 
 _WALLPAPER = SurfaceStyle((0.62, 0.66, 0.75), (0.85, 0.8, 0.7), "dots", 0.45, contrast=0.3)
 _SIDE_WALL = SurfaceStyle((0.75, 0.66, 0.55), (0.6, 0.62, 0.6), "stripes", 0.6, (0.4, 0.9, 0.1))
@@ -27,7 +27,7 @@ def _table() -> Mesh:
 
 
 def furnished_room() -> list[tuple[Mesh, SurfaceStyle]]:
-    """Return the static meshes, in world coordinates and metres, with their paint."""
+    """Return the static meshes, in world coordinates and meters, with their paint."""
     left, right, ceiling, floor, front, back = box_faces(ROOM_SIZE_M)
     return [
         (left, _SIDE_WALL),

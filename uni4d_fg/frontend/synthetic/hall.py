@@ -46,7 +46,7 @@ class HallFrame:
     """One frame and its cues."""
 
     image: ImageArray
-    """(H, W, 3) flat grey."""
+    """(H, W, 3) flat gray."""
     depth: Float32Array
     """(H, W) noisy cue, m."""
     mask: Int32Array

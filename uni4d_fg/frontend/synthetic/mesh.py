@@ -14,12 +14,12 @@ class Mesh:
     """A triangle mesh in its rest pose."""
 
     vertices: FloatArray
-    """(V, 3) metres."""
+    """(V, 3) meters."""
     triangles: IntArray
     """(F, 3) vertex indices."""
 
     def translated(self, offset: tuple[float, float, float]) -> Mesh:
-        """Return the mesh moved by ``offset`` metres."""
+        """Return the mesh moved by ``offset`` meters."""
         return Mesh(self.vertices + np.asarray(offset, dtype=np.float64), self.triangles)
 
 
@@ -33,10 +33,10 @@ def concatenate(meshes: list[Mesh]) -> Mesh:
 
 
 def box_faces(size: tuple[float, float, float]) -> list[Mesh]:
-    """Return the six faces of a box centred at the origin, two triangles each.
+    """Return the six faces of a box centered at the origin, two triangles each.
 
     Args:
-        size: Extent along x, y and z, metres.
+        size: Extent along x, y and z, meters.
 
     Returns:
         Faces in the order -x, +x, -y, +y, -z, +z.
@@ -55,7 +55,7 @@ def box_faces(size: tuple[float, float, float]) -> list[Mesh]:
 
 
 def box(size: tuple[float, float, float]) -> Mesh:
-    """Return a box of extent ``size`` metres centred at the origin."""
+    """Return a box of extent ``size`` meters centered at the origin."""
     return concatenate(box_faces(size))
 
 
@@ -63,7 +63,7 @@ def surface_of_revolution(profile: FloatArray, segments: int) -> Mesh:
     """Turn a profile around the y axis; both ends are closed by a single vertex on the axis.
 
     Args:
-        profile: (N, 2) radius and y of the rings in metres; the first and last radius are taken as zero.
+        profile: (N, 2) radius and y of the rings in meters; the first and last radius are taken as zero.
         segments: Vertices per ring.
 
     Returns:
@@ -94,17 +94,17 @@ def surface_of_revolution(profile: FloatArray, segments: int) -> Mesh:
 
 
 def sphere(radius: float, segments: int = 48) -> Mesh:
-    """Return a sphere of ``radius`` metres centred at the origin."""
+    """Return a sphere of ``radius`` meters centered at the origin."""
     angle = np.linspace(0.0, np.pi, segments // 2 + 1)
     return surface_of_revolution(radius * np.stack((np.sin(angle), -np.cos(angle)), axis=-1), segments)
 
 
 def capsule(radius: float, height: float, segments: int = 48, rings: int = 40) -> Mesh:
-    """Return a capsule along y centred at the origin.
+    """Return a capsule along y centered at the origin.
 
     Args:
-        radius: Radius, metres.
-        height: Total height, at least twice the radius, metres.
+        radius: Radius, meters.
+        height: Total height, at least twice the radius, meters.
         segments: Vertices per ring.
         rings: Rings along the straight part.
     """

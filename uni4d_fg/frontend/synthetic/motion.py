@@ -14,7 +14,7 @@ Vector = tuple[float, float, float]
 
 
 class Motion(Protocol):
-    """Maps rest-pose vertices (V, 3) to world positions (V, 3) at a time in seconds, metres."""
+    """Maps rest-pose vertices (V, 3) to world positions (V, 3) at a time in seconds, meters."""
 
     def __call__(self, rest: FloatArray, time: float) -> FloatArray:
         """Return the world positions of ``rest`` at ``time``."""
@@ -34,10 +34,10 @@ class Still:
 class RigidMotion:
     """Translation along a closed curve with a steady rotation."""
 
-    centre: Vector
-    """Middle of the curve, world, metres."""
+    center: Vector
+    """Middle of the curve, world, meters."""
     swing: Vector
-    """Amplitude along each axis, metres."""
+    """Amplitude along each axis, meters."""
     frequency: Vector
     """Oscillations per second along each axis, Hz."""
     phase: Vector
@@ -48,10 +48,10 @@ class RigidMotion:
     """World-frame angular velocity, rad/s; its direction is constant."""
 
     def pose(self, time: float) -> FloatArray:
-        """Return (4, 4) world_T_object at ``time`` seconds: the object's frame is the one of its rest pose, metres."""
+        """Return (4, 4) world_T_object at ``time`` seconds: the object's frame is the one of its rest pose, meters."""
         angle = 2.0 * np.pi * np.asarray(self.frequency) * time + np.asarray(self.phase)
         world_T_object = np.eye(4)
-        world_T_object[:3, 3] = np.asarray(self.centre) + np.asarray(self.swing) * np.sin(angle)
+        world_T_object[:3, 3] = np.asarray(self.center) + np.asarray(self.swing) * np.sin(angle)
         world_T_object[:3, :3] = so3_exp(np.asarray(self.rotation_rate) * time) @ so3_exp(
             np.asarray(self.tilt, dtype=np.float64)
         )
@@ -71,11 +71,11 @@ class WobblyMotion:
     carrier: RigidMotion
     """Motion of the body as a whole."""
     height_m: float
-    """Height of the rest body, metres."""
+    """Height of the rest body, meters."""
     bend_m: float = 0.14
-    """Sideways excursion of the ends by bending, metres."""
+    """Sideways excursion of the ends by bending, meters."""
     wave_m: float = 0.04
-    """Amplitude of the wave that runs along the body, metres."""
+    """Amplitude of the wave that runs along the body, meters."""
     twist_rad: float = 0.6
     """Twist between the two ends, rad."""
     bulge: float = 0.16

@@ -51,7 +51,7 @@ def noisy_tracks(exact: ExactTracks, noise: CueNoise, image_size: tuple[int, int
 
 
 def _inside(uv: FloatArray | Float32Array, height: int, width: int) -> BoolArray:
-    """Return whether pixels (..., 2) lie between the centres of the outermost pixels; NaN does not."""
+    """Return whether pixels (..., 2) lie between the centers of the outermost pixels; NaN does not."""
     u, v = uv[..., 0], uv[..., 1]
     return np.asarray((u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1))
 
@@ -69,12 +69,12 @@ def noisy_depths(depths: Float32Array, noise: CueNoise, seed: int) -> tuple[Floa
     """Degrade exact depth maps: a log-scale per frame, a smooth field, noise per pixel, and holes.
 
     Args:
-        depths: (T, H, W) exact z-depth, metres, NaN where missing.
+        depths: (T, H, W) exact z-depth, meters, NaN where missing.
         noise: Its amounts.
         seed: Seed of the random choices.
 
     Returns:
-        (T, H, W) float32 depth cue, metres, NaN where missing, and (T,) the frames' true log-scales: the
+        (T, H, W) float32 depth cue, meters, NaN where missing, and (T,) the frames' true log-scales: the
         cue of frame t times ``exp(log_scale[t])`` is the true depth, up to field and pixel noise.
     """
     rng = np.random.default_rng([seed, _DEPTH_STREAM])

@@ -31,7 +31,7 @@ class RayCaster:
     """A mesh frozen at one time, ready for ray queries.
 
     Args:
-        vertices: (V, 3) world positions, metres.
+        vertices: (V, 3) world positions, meters.
         triangles: (F, 3) vertex indices.
 
     Raises:
@@ -50,7 +50,7 @@ class RayCaster:
         """Cast rays from one point.
 
         Args:
-            origin: (3,) world position, metres.
+            origin: (3,) world position, meters.
             direction: (N, 3) world directions of any length.
         """
         rays = np.empty((len(direction), 6), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Rendering of one frame: colour, exact depth and instance ids."""
+"""Rendering of one frame: color, exact depth and instance ids."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class RenderedFrame:
     """What the camera sees at one time."""
 
     depth: Float32Array
-    """(H, W) exact z-depth, metres, NaN where nothing is met."""
+    """(H, W) exact z-depth, meters, NaN where nothing is met."""
     instance: Int32Array
     """(H, W) instance ids, 0 where static."""
     image: ImageArray | None
-    """(H, W, 3) RGB, or None when colour was not asked for."""
+    """(H, W, 3) RGB, or None when color was not asked for."""
 
 
 def pixel_grid(height: int, width: int) -> FloatArray:
-    """Return (H * W, 2) pixel centres (x, y) in row-major order; centres are at integers."""
+    """Return (H * W, 2) pixel centers (x, y) in row-major order; centers are at integers."""
     v, u = np.mgrid[:height, :width]
     return np.stack((u.ravel(), v.ravel()), axis=-1).astype(np.float64)
 
@@ -48,23 +48,23 @@ def cast_pixels(caster: RayCaster, world_T_cam: FloatArray, intrinsics: FloatArr
     return caster.cast(world_T_cam[:3, 3], direction)
 
 
-def _shade(scene: Scene, vertices: FloatArray, centre: FloatArray, hits: Hits) -> FloatArray:
+def _shade(scene: Scene, vertices: FloatArray, center: FloatArray, hits: Hits) -> FloatArray:
     """Return (N, 3) RGB in [0, 1]: texture times a Lambertian term of a light fixed in the world."""
-    colour = np.zeros((len(hits.triangle), 3))
+    color = np.zeros((len(hits.triangle), 3))
     facing_light = np.zeros(len(hits.triangle))
     valid = np.flatnonzero(hits.valid)
     triangle, barycentric = hits.triangle[valid], hits.barycentric[valid]
     normals = triangle_normals(vertices, scene.triangles)
     first_corner = vertices[scene.triangles[:, 0]]
     # Normals are turned towards the camera: walls are seen from inside, objects from outside.
-    side = np.where(np.sum(normals * (centre - first_corner), axis=-1) < 0, -1.0, 1.0)
+    side = np.where(np.sum(normals * (center - first_corner), axis=-1) < 0, -1.0, 1.0)
     facing_light[valid] = np.maximum(side * (normals @ _LIGHT), 0.0)[triangle]
     rest = interpolate(scene.rest_vertices, scene.triangles, triangle, barycentric)
     owner = scene.triangle_object[triangle]
     for index in np.unique(owner):
         mine = owner == index
-        colour[valid[mine]] = reflectance(scene.objects[index].style, rest[mine])
-    result: FloatArray = colour * (_AMBIENT + (1.0 - _AMBIENT) * facing_light)[:, None]
+        color[valid[mine]] = reflectance(scene.objects[index].style, rest[mine])
+    result: FloatArray = color * (_AMBIENT + (1.0 - _AMBIENT) * facing_light)[:, None]
     return result
 
 
@@ -79,17 +79,17 @@ def render_frame(
 ) -> RenderedFrame:
     """Render one frame.
 
-    Depth and ids are those of the ray through the pixel's centre; colour alone is anti-aliased by 2 x 2
+    Depth and ids are those of the ray through the pixel's center; color alone is anti-aliased by 2 x 2
     supersampling.
 
     Args:
         scene: Topology, texture and instance ids.
-        vertices: (V, 3) the scene's vertices at this time, metres.
+        vertices: (V, 3) the scene's vertices at this time, meters.
         caster: Ray caster on those vertices.
         world_T_cam: (4, 4) camera to world.
         intrinsics: (4,) fx, fy, cx, cy, px.
         image_size: (height, width), px.
-        with_image: Whether to shade colour.
+        with_image: Whether to shade color.
     """
     height, width = image_size
     uv = pixel_grid(height, width)

@@ -54,11 +54,11 @@ class Scene:
 
     @cached_property
     def rest_vertices(self) -> FloatArray:
-        """(V, 3) rest-pose coordinates, metres, each object in its own frame: where the texture lives."""
+        """(V, 3) rest-pose coordinates, meters, each object in its own frame: where the texture lives."""
         return np.concatenate([o.mesh.vertices for o in self.objects])
 
     def vertices(self, time: float) -> FloatArray:
-        """Return (V, 3) world positions at ``time`` seconds, metres."""
+        """Return (V, 3) world positions at ``time`` seconds, meters."""
         return np.concatenate([o.motion(o.mesh.vertices, time) for o in self.objects])
 
     def rigid_poses(self, times: FloatArray) -> tuple[Int32Array, FloatArray]:
@@ -68,7 +68,7 @@ class Scene:
             times: (T,) seconds.
 
         Returns:
-            (J,) instance ids, ascending, and (J, T, 4, 4) world_T_object, metres.
+            (J,) instance ids, ascending, and (J, T, 4, 4) world_T_object, meters.
         """
         motions = {o.instance: o.motion for o in self.objects if isinstance(o.motion, RigidMotion)}
         poses = [np.stack([motions[i].pose(time) for time in times.tolist()]) for i in sorted(motions)]
@@ -78,13 +78,13 @@ class Scene:
 _RIGID_STYLE = SurfaceStyle((0.85, 0.25, 0.15), (0.95, 0.85, 0.55), "checks", 0.22, (0.3, 1.1, 0.5), 0.7)
 _DEFORMING_STYLE = SurfaceStyle((0.15, 0.6, 0.3), (0.9, 0.9, 0.35), "checks", 0.14, (1.7, 0.2, 0.9), 0.75)
 _DEFORMING_HEIGHT_M = 0.78
-_RIGID_CENTRES = ((-0.35, 0.2, 0.15), (-0.9, -0.3, 1.05), (0.25, -0.6, 1.1))
-_DEFORMING_CENTRES = ((0.55, 0.33, 0.45), (1.0, -0.3, 1.2), (-0.3, -0.05, 1.75))
+_RIGID_CENTERS = ((-0.35, 0.2, 0.15), (-0.9, -0.3, 1.05), (0.25, -0.6, 1.1))
+_DEFORMING_CENTERS = ((0.55, 0.33, 0.45), (1.0, -0.3, 1.2), (-0.3, -0.05, 1.75))
 
 
 def _rigid_object(index: int) -> SceneObject:
     motion = RigidMotion(
-        centre=_RIGID_CENTRES[index],
+        center=_RIGID_CENTERS[index],
         swing=(0.3, 0.12, 0.2),
         frequency=(0.24, 0.31, 0.2),
         phase=(-0.9 + 1.7 * index, 0.4 + index, 1.0 - index),
@@ -98,7 +98,7 @@ def _rigid_object(index: int) -> SceneObject:
 
 def _deforming_object(index: int) -> SceneObject:
     carrier = RigidMotion(
-        centre=_DEFORMING_CENTRES[index],
+        center=_DEFORMING_CENTERS[index],
         swing=(0.18, 0.05, 0.2),
         frequency=(0.27, 0.4, 0.22),
         phase=(2.6 + 1.3 * index, index, 0.3 + index),
@@ -128,7 +128,7 @@ def make_scene(objects: ObjectChoice = "both", objects_per_kind: int = 1) -> Sce
     if objects == "all_dynamic":
         room_instance = 2 * objects_per_kind + 1
         room_motion = RigidMotion(
-            centre=(0.0, 0.0, 0.0),
+            center=(0.0, 0.0, 0.0),
             swing=(0.15, 0.03, 0.1),
             frequency=(0.3, 0.4, 0.25),
             phase=(0.0, 0.0, 0.0),

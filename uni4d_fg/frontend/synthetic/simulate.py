@@ -16,7 +16,7 @@ from uni4d_fg.frontend.synthetic.render import render_frame
 from uni4d_fg.frontend.synthetic.scene import make_scene
 from uni4d_fg.frontend.synthetic.tracks import ExactTracks, SurfacePoints, TrackFollower, pick_points, query_grid
 
-_FLAT_GREY = np.uint8(128)
+_FLAT_GRAY = np.uint8(128)
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def simulate(config: SyntheticSceneConfig) -> Simulation:
 
     depths = np.empty((config.num_frames, *image_size), dtype=np.float32)
     masks = np.empty((config.num_frames, *image_size), dtype=np.int32)
-    images: ImageArray = np.broadcast_to(_FLAT_GREY, (config.num_frames, *image_size, 3))
+    images: ImageArray = np.broadcast_to(_FLAT_GRAY, (config.num_frames, *image_size, 3))
     if config.render_images:
         images = np.empty((config.num_frames, *image_size, 3), dtype=np.uint8)
     grid = query_grid(image_size, config.grid_columns, config.grid_rows, config.margin_px)

@@ -1,4 +1,4 @@
-"""A solid texture: colour as a function of rest-pose coordinates, so that it sticks to what moves and bends."""
+"""A solid texture: color as a function of rest-pose coordinates, so that it sticks to what moves and bends."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class SurfaceStyle:
     pattern: Literal["none", "stripes", "checks", "dots"] = "none"
     """Regular pattern on top of the noise."""
     wavelength_m: float = 0.2
-    """Period of the pattern, metres."""
+    """Period of the pattern, meters."""
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Shift in the noise, metres, so that equal shapes differ."""
+    """Shift in the noise, meters, so that equal shapes differ."""
     contrast: float = 0.45
     """Relative amplitude of the fine noise."""
 
@@ -76,7 +76,7 @@ def solid_noise(points: FloatArray) -> Float32Array:
     """Sample the noise.
 
     Args:
-        points: (N, 3) metres; the noise repeats every 2.56 m.
+        points: (N, 3) meters; the noise repeats every 2.56 m.
 
     Returns:
         (N,) values of zero mean and unit deviation.
@@ -105,7 +105,7 @@ def reflectance(style: SurfaceStyle, points: FloatArray) -> FloatArray:
 
     Args:
         style: Paint of the object that the points belong to.
-        points: (N, 3) rest-pose coordinates, metres.
+        points: (N, 3) rest-pose coordinates, meters.
 
     Returns:
         (N, 3) RGB reflectance in [0, 1].
@@ -115,6 +115,6 @@ def reflectance(style: SurfaceStyle, points: FloatArray) -> FloatArray:
     coarse = solid_noise(0.35 * shifted[:, [1, 2, 0]] + 0.7)
     blend = 0.5 + 0.35 * np.tanh(1.2 * coarse) + 0.3 * _pattern(style, points)
     blend = np.clip(blend, 0.0, 1.0)[:, None]
-    colour = (1.0 - blend) * np.asarray(style.first) + blend * np.asarray(style.second)
-    result: FloatArray = np.clip(colour * (1.0 + style.contrast * np.tanh(0.9 * fine))[:, None], 0.0, 1.0)
+    color = (1.0 - blend) * np.asarray(style.first) + blend * np.asarray(style.second)
+    result: FloatArray = np.clip(color * (1.0 + style.contrast * np.tanh(0.9 * fine))[:, None], 0.0, 1.0)
     return result

@@ -45,7 +45,7 @@ class ExactTracks:
     """K noise-free tracks over T frames."""
 
     points: FloatArray
-    """(K, T, 3) world positions, metres, in every frame whether seen or not."""
+    """(K, T, 3) world positions, meters, in every frame whether seen or not."""
     uv: FloatArray
     """(K, T, 2) projections, px, NaN for points less than 5 cm in front of the camera."""
     visible: BoolArray
@@ -83,7 +83,7 @@ def project_points(
 
     Returns:
         (K, 2) pixels, NaN for points less than 5 cm in front of the camera, and (K,) whether the pixel lies
-        inside the image (between the centres of its outermost pixels).
+        inside the image (between the centers of its outermost pixels).
     """
     height, width = image_size
     point_cam = world_to_camera(world_T_cam, points)
@@ -93,14 +93,14 @@ def project_points(
     return uv, inside
 
 
-def facing(normal: FloatArray, points: FloatArray, centre: FloatArray) -> BoolArray:
-    """Return (K,) whether the camera ``centre`` lies on the side of the surface that its normal points to."""
-    return np.asarray(np.sum(normal * (centre - points), axis=-1) > 0)
+def facing(normal: FloatArray, points: FloatArray, center: FloatArray) -> BoolArray:
+    """Return (K,) whether the camera ``center`` lies on the side of the surface that its normal points to."""
+    return np.asarray(np.sum(normal * (center - points), axis=-1) > 0)
 
 
-def unoccluded(caster: RayCaster, centre: FloatArray, points: FloatArray) -> BoolArray:
-    """Return (K,) whether nothing lies between the camera ``centre`` and ``points``, to 1e-3 of the distance."""
-    return np.asarray(caster.cast(centre, points - centre).distance >= 1.0 - _OCCLUSION_TOLERANCE)
+def unoccluded(caster: RayCaster, center: FloatArray, points: FloatArray) -> BoolArray:
+    """Return (K,) whether nothing lies between the camera ``center`` and ``points``, to 1e-3 of the distance."""
+    return np.asarray(caster.cast(center, points - center).distance >= 1.0 - _OCCLUSION_TOLERANCE)
 
 
 class TrackFollower:

@@ -22,14 +22,14 @@ def sample_depth(
     nearest pixel is taken if it is valid and the valid ones agree in the same sense.
 
     Args:
-        depth: (H, W) metres, NaN where missing.
-        uv: (N, 2) finite pixels; positions outside the pixel centres are moved to the nearest one.
-        min_depth_m: Smaller depth is missing, metres.
-        max_depth_m: Larger depth is missing, metres.
+        depth: (H, W) meters, NaN where missing.
+        uv: (N, 2) finite pixels; positions outside the pixel centers are moved to the nearest one.
+        min_depth_m: Smaller depth is missing, meters.
+        max_depth_m: Larger depth is missing, meters.
         max_relative_spread: Largest relative difference that is still one surface.
 
     Returns:
-        (N,) float32 metres, NaN where missing.
+        (N,) float32 meters, NaN where missing.
     """
     height, width = depth.shape
     x = np.clip(uv[:, 0].astype(np.float64), 0, width - 1)

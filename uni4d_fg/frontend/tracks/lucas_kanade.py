@@ -4,7 +4,7 @@ A grid of query points is started in frames 0, ``query_interval``, 2 ``query_int
 the video follow them: one forwards, in which every grid joins as the sweep passes its frame, and one
 backwards. A step moves all live points of all grids at once, so that a sweep costs two optical-flow calls
 per pair of frames, however many grids there are, plus a short one per live grid for the drift check. Only
-the two images of the step are held, and for the drift check the grey query images of live points.
+the two images of the step are held, and for the drift check the gray query images of live points.
 
 A point that fails a check of :mod:`uni4d_fg.frontend.tracks.optical_flow` is lost, and not looked for again. Where the
 forward sweep leaves a cell of the image empty between two grids, a new point starts
@@ -56,7 +56,7 @@ def track_grid(
     """Track grids of points through a video.
 
     Args:
-        images: T images (H, W, 3) uint8 RGB, or (H, W) uint8 grey; each is read twice, in order.
+        images: T images (H, W, 3) uint8 RGB, or (H, W) uint8 gray; each is read twice, in order.
         config: Grid, window and checks.
         progress: Told the steps done and to do after every step.
         should_stop: Asked before every step.
@@ -71,7 +71,7 @@ def track_grid(
     num_frames = len(images)
     if num_frames == 0:
         raise InputError("tracking: the sequence has no images")
-    image_size = _grey(images[0], None, 0).shape
+    image_size = _gray(images[0], None, 0).shape
     grid = query_grid((image_size[0], image_size[1]), config)
     queries: dict[int, _Queries] = {}
     observations: _Observations = []
@@ -82,7 +82,7 @@ def track_grid(
         for frame in range(num_frames) if forwards else range(num_frames - 1, -1, -1):
             if should_stop is not None and should_stop():
                 raise Cancelled(f"tracking stopped at step {steps_done} of {steps}")
-            image = _grey(images[frame], image_size, frame)
+            image = _gray(images[frame], image_size, frame)
             if previous is not None:
                 live.move(previous, image, config)
                 observations.append((frame, live.track, live.points))
@@ -159,17 +159,17 @@ class _LivePoints:
         self.track, self.points = self.track[keep], self.points[keep]
 
 
-def _grey(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> ImageArray:
+def _gray(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> ImageArray:
     """Return the image as (H, W) uint8; ``expected`` is the size of the first frame."""
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
         raise InputError(
             f"tracking: image {frame} has dtype {image.dtype} and shape {image.shape}; "
             "expected uint8 (H, W, 3) or (H, W)"
         )
-    grey = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    if expected is not None and grey.shape != expected:
-        raise InputError(f"tracking: image {frame} is {grey.shape}, the first one is {expected}")
-    return np.ascontiguousarray(grey)
+    gray = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    if expected is not None and gray.shape != expected:
+        raise InputError(f"tracking: image {frame} is {gray.shape}, the first one is {expected}")
+    return np.ascontiguousarray(gray)
 
 
 def _assemble(

@@ -12,7 +12,7 @@ from uni4d_fg.config.cues import TrackingConfig
 def move_points(
     source: ImageArray, target: ImageArray, points: Float32Array, config: TrackingConfig
 ) -> tuple[BoolArray, Float32Array]:
-    """Move points from one grey image to the next.
+    """Move points from one gray image to the next.
 
     A point is dropped if its window has no texture, if the window at its new place looks different, if
     tracking it back misses where it came from, or if it comes too close to the image border.

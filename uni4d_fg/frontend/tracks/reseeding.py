@@ -19,7 +19,7 @@ def corners_of_empty_cells(image: ImageArray, points: Float32Array, config: Trac
     whose best falls short of ``reseed_quality`` times the image's best stays empty.
 
     Args:
-        image: (H, W) uint8, grey.
+        image: (H, W) uint8, gray.
         points: (N, 2) live points, px.
         config: The grid, ``reseed_spacing`` (None gives no points), ``reseed_quality`` and ``margin_px``.
 

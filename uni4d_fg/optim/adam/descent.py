@@ -61,7 +61,7 @@ def descend(
     name: str = "descent",
     hooks: Hooks | None = None,
 ) -> Trace:
-    """Minimise a loss in place with a new optimiser.
+    """Minimize a loss in place with a new optimizer.
 
     Args:
         torch: The module.
@@ -78,11 +78,11 @@ def descend(
     """
     hooks = hooks or Hooks()
     leaves = dict(parameters)
-    optimiser = torch.optim.Adam(
+    optimizer = torch.optim.Adam(
         [{"params": [leaf], "lr": learning_rate(key, schedule)} for key, leaf in leaves.items()], amsgrad=amsgrad
     )
     plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(
-        optimiser,
+        optimizer,
         factor=schedule.plateau_factor,
         patience=schedule.plateau_patience,
         threshold=schedule.plateau_threshold,
@@ -94,7 +94,7 @@ def descend(
         if hooks.should_stop is not None and hooks.should_stop():
             trace.termination = Termination.CANCELLED
             break
-        optimiser.zero_grad(set_to_none=True)
+        optimizer.zero_grad(set_to_none=True)
         loss = loss_of()
         loss.backward()
         value = float(loss.detach())
@@ -102,7 +102,7 @@ def descend(
             raise SolverError(f"{name}: the loss is {value} in iteration {len(trace.losses) + 1}; lower learning rates")
         if keep_best and value < lowest:
             lowest, trace.best = value, {key: leaf.detach().clone() for key, leaf in leaves.items()}
-        optimiser.step()
+        optimizer.step()
         plateau.step(value)
         trace.losses.append(value)
         trace.seconds.append(time.perf_counter() - began)
@@ -111,7 +111,7 @@ def descend(
         if stopping.stops_at(value):
             trace.termination = Termination.EARLY_STOPPED
             break
-    trace.learning_rates = {key: group["lr"] for key, group in zip(leaves, optimiser.param_groups, strict=True)}
+    trace.learning_rates = {key: group["lr"] for key, group in zip(leaves, optimizer.param_groups, strict=True)}
     if keep_best and float(loss_of().detach()) < lowest:
         trace.best = None
     return trace

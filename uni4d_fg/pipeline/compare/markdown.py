@@ -58,7 +58,7 @@ def whole_runs_table(comparison: Comparison) -> list[str]:
         seconds = [f"{run.seconds[stage]:.2f}" for stage in STAGES]
         memory = "-" if run.extra_memory_mb is None else f"{run.extra_memory_mb:.0f}"
         scores = [f"{run.accuracy[m]:.4g}" if m in run.accuracy else "-" for m in metrics]
-        rows.append([name, *seconds, f"{run.optimisation_seconds:.2f}", memory, *scores])
+        rows.append([name, *seconds, f"{run.optimization_seconds:.2f}", memory, *scores])
     return table(head, rows)
 
 

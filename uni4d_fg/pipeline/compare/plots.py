@@ -24,7 +24,7 @@ from uni4d_fg.results.pictures.figure import (
 )
 from uni4d_fg.results.run_folder import RunFolder
 
-_COLOURS = ("#0b6e4f", "#c8553d", "#3d5a98", "#b58900", "#7b4fa3")
+_COLORS = ("#0b6e4f", "#c8553d", "#3d5a98", "#b58900", "#7b4fa3")
 _DEPTH_FRAMES = 4
 
 
@@ -41,12 +41,12 @@ def draw_energies(path: Path, benchmarks: list[Benchmark], title: str) -> None:
     for index, benchmark in enumerate(benchmarks):
         panel = figure.add_subplot(rows, columns, index + 1)
         _style(panel, f"{benchmark.kind} from {benchmark.start}", "wall time [s]", "exact energy")
-        for colour, (name, performance) in zip(_COLOURS * 9, benchmark.performances.items(), strict=False):
+        for color, (name, performance) in zip(_COLORS * 9, benchmark.performances.items(), strict=False):
             curve = np.array(performance.curve)
             start = np.array([[curve[1:, 0].min(initial=1e-3), curve[0, 1]]])
             seconds, energy = np.concatenate((start, curve[1:])).T
-            panel.plot(seconds, energy, color=colour, linewidth=1.8, label=name, drawstyle="steps-post")
-            panel.plot(seconds[-1], energy[-1], "o", color=colour, markersize=4)
+            panel.plot(seconds, energy, color=color, linewidth=1.8, label=name, drawstyle="steps-post")
+            panel.plot(seconds[-1], energy[-1], "o", color=color, markersize=4)
         panel.set_xscale("log")
         panel.set_yscale("log")
         panel.legend(frameon=False, fontsize=8, labelcolor=INK)
@@ -69,10 +69,10 @@ def draw_paths(path: Path, poses: Mapping[str, FloatArray], truth: FloatArray | 
         if truth is not None:
             flat = (truth[known][:, :3, 3] - origin) @ axes.T
             panel.plot(flat[:, i], flat[:, j], color=INK, linewidth=1.2, linestyle=(0, (4, 2)), label="ground truth")
-        for colour, (solver, estimate) in zip(_COLOURS * 9, poses.items(), strict=False):
+        for color, (solver, estimate) in zip(_COLORS * 9, poses.items(), strict=False):
             aligned = align_trajectories(estimate[known], reference[known]).apply_poses(estimate)
             flat = (aligned[:, :3, 3] - origin) @ axes.T
-            panel.plot(flat[:, i], flat[:, j], color=colour, linewidth=1.8, label=solver)
+            panel.plot(flat[:, i], flat[:, j], color=color, linewidth=1.8, label=solver)
         panel.set_aspect("equal", adjustable="datalim")
         panel.legend(frameon=False, fontsize=9, labelcolor=INK)
     save_figure(path, figure)

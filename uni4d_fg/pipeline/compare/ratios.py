@@ -97,6 +97,6 @@ def losses(comparison: Comparison) -> list[str]:
             theirs = run.accuracy.get(metric)
             if theirs is not None and value > theirs * (1.0 + 1e-3):
                 out.append(f"accuracy of the whole run: {metric} is {value:.4g} with LM, {theirs:.4g} with {name}")
-        if comparison.runs[LM].optimisation_seconds > run.optimisation_seconds:
+        if comparison.runs[LM].optimization_seconds > run.optimization_seconds:
             out.append(f"whole run: stages 1 to 3 take LM longer than {name}")
     return out

@@ -28,7 +28,7 @@ class WholeRun:
     """Scores against the ground truth, those that it allows; lower is better."""
 
     @property
-    def optimisation_seconds(self) -> float:
+    def optimization_seconds(self) -> float:
         """Wall time of stages 1 to 3."""
         return sum(self.seconds[stage] for stage in STAGES)
 

@@ -113,8 +113,8 @@ def evaluate_depth(
     region. A pixel is valid if 0 < truth <= cap and the prediction is finite and positive.
 
     Args:
-        prediction: T maps (H, W), metres; NaN (or not positive) where missing.
-        ground_truth: T maps (H, W), metres; NaN (or not positive) where unknown.
+        prediction: T maps (H, W), meters; NaN (or not positive) where missing.
+        ground_truth: T maps (H, W), meters; NaN (or not positive) where unknown.
         masks: T label maps (H, W), 0 static; adds the regions static, dynamic and each instance.
         alignments: Which alignments to score.
         max_depth_m: Truth beyond this is not scored, predictions are clipped to it.

@@ -16,7 +16,7 @@ class ScaleFlicker:
     standard_deviation: float | None
     """Of s_t about its mean over the frames scored; None without any."""
     frame_to_frame: float | None
-    """Standard deviation of s_{t+1} - s_t, of neighbouring frames that are both scored; None without any."""
+    """Standard deviation of s_{t+1} - s_t, of neighboring frames that are both scored; None without any."""
     log_scales: tuple[float | None, ...]
     """s_t per frame; None where a frame has no static valid pixel."""
     frames_scored: int

@@ -19,9 +19,9 @@ class PointMetrics:
     protocol: str
     """Which points were scored and how the worlds were aligned."""
     rmse_m: float | None
-    """Root mean square distance, metres."""
+    """Root mean square distance, meters."""
     median_m: float | None
-    """Median distance, metres."""
+    """Median distance, meters."""
     points: int
     """Positions scored."""
     missing_estimates: int
@@ -45,8 +45,8 @@ def evaluate_points(
     """Score points, or trajectories of points, against the truth.
 
     Args:
-        estimate: (..., 3), e.g. (M, T, 3) trajectories or (N, 3) landmarks, metres; NaN where not estimated.
-        reference: (..., 3) true world positions, metres; NaN where unknown.
+        estimate: (..., 3), e.g. (M, T, 3) trajectories or (N, 3) landmarks, meters; NaN where not estimated.
+        reference: (..., 3) true world positions, meters; NaN where unknown.
         mask: (...) True where a position is to be scored; None selects all.
         alignment: Map from the estimate's world to the true one; None leaves the estimate as it is.
         protocol: Text for the result.

@@ -37,8 +37,8 @@ class StreamingLogMedian:
         if total == 0:
             return None
         below = np.searchsorted(cumulative, [(total - 1) // 2, total // 2], side="right")
-        centres = np.exp((below + 0.5) * _BIN_WIDTH - _HALF_RANGE)
-        return float(centres.mean())
+        centers = np.exp((below + 0.5) * _BIN_WIDTH - _HALF_RANGE)
+        return float(centers.mean())
 
 
 @dataclass

@@ -20,12 +20,12 @@ _ALIGNMENT_NAMES = {"sim3": "Sim(3) Umeyama", "se3": "SE(3) Umeyama", "none": "n
 
 @dataclass(frozen=True)
 class TrajectoryMetrics:
-    """Trajectory errors; lengths in metres of the ground truth, angles in degrees."""
+    """Trajectory errors; lengths in meters of the ground truth, angles in degrees."""
 
     protocol: str
     """How the numbers were computed."""
     ate_m: float
-    """Root mean square distance of the camera centres after alignment."""
+    """Root mean square distance of the camera centers after alignment."""
     rpe_translation_m: float | None
     """Root mean square translation of the relative pose error; None with fewer than two poses."""
     rpe_rotation_deg: float | None
@@ -33,7 +33,7 @@ class TrajectoryMetrics:
     scale: float
     """Reference length per estimate length, as the alignment found it."""
     degenerate: Degeneracy
-    """Why the centres did not determine the alignment, or 'none'."""
+    """Why the centers did not determine the alignment, or 'none'."""
     poses: int
     """Pose pairs compared."""
     path_length_estimate_m: float
@@ -47,7 +47,7 @@ class TrajectoryMetrics:
 
 
 def path_length(world_T_cam: FloatArray) -> float:
-    """Return the length of the polyline through the camera centres of (T, 4, 4) poses, metres."""
+    """Return the length of the polyline through the camera centers of (T, 4, 4) poses, meters."""
     return float(np.linalg.norm(np.diff(world_T_cam[:, :3, 3], axis=0), axis=1).sum())
 
 
@@ -61,7 +61,7 @@ def evaluate_trajectory(
 
     Args:
         estimate: (T, 4, 4) camera to world.
-        reference: (T, 4, 4) camera to world, metres.
+        reference: (T, 4, 4) camera to world, meters.
         alignment: Similarity, rigid motion, or none.
         delta: Distance of the relative error's pairs, frames.
 
@@ -98,7 +98,7 @@ def evaluate_trajectory(
 def relative_pose_errors(
     estimate: FloatArray, reference: FloatArray, *, delta: int = 1
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the relative errors of all pairs ``delta`` frames apart: (T - delta,) metres and degrees."""
+    """Return the relative errors of all pairs ``delta`` frames apart: (T - delta,) meters and degrees."""
     if len(estimate) <= delta:
         return np.zeros(0), np.zeros(0)
     motion_estimate = se3.inverse(estimate[:-delta]) @ estimate[delta:]

@@ -1,6 +1,6 @@
 """COLMAP: ``images/``, ``sparse/0`` (binary), ``sparse_text/0``, optionally ``masks/`` and ``depth_maps/``.
 
-COLMAP's poses are world to camera with the scalar of the quaternion first, and its pixel centres are at 0.5:
+COLMAP's poses are world to camera with the scalar of the quaternion first, and its pixel centers are at 0.5:
 0.5 is added to cx, cy and to every observation.
 """
 
@@ -101,4 +101,4 @@ def _write_depth(job: ExportJob, folder: Path, names: SequenceOf[str]) -> None:
     for name, depth in zip(names, depths, strict=True):
         (folder / f"{name}.geometric.bin").write_bytes(depth_map_bytes(depth))
         job.check()
-    job.facts.append("depth_maps/: dense depth, metres, as in a dense workspace's stereo/depth_maps")
+    job.facts.append("depth_maps/: dense depth, meters, as in a dense workspace's stereo/depth_maps")

@@ -20,7 +20,7 @@ CAMERA_MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """One camera, T images and P points, in COLMAP's conventions: world to camera, pixel centres at 0.5."""
+    """One camera, T images and P points, in COLMAP's conventions: world to camera, pixel centers at 0.5."""
 
     image_size: tuple[int, int]
     """(height, width), px."""
@@ -32,9 +32,9 @@ class ColmapModel:
     quaternions: FloatArray
     """(T, 4) w, x, y, z of the rotation from world to camera."""
     translations: FloatArray
-    """(T, 3) metres."""
+    """(T, 3) meters."""
     points: FloatArray
-    """(P, 3) metres."""
+    """(P, 3) meters."""
     colors: ImageArray
     """(P, 3) RGB."""
     errors: FloatArray
@@ -126,7 +126,7 @@ def write_text(model: ColmapModel, folder: Path) -> None:
 
 
 def depth_map_bytes(depth: Float32Array) -> bytes:
-    """Return a depth map (H, W), metres, in the format of COLMAP's dense workspace; 0 where missing."""
+    """Return a depth map (H, W), meters, in the format of COLMAP's dense workspace; 0 where missing."""
     height, width = depth.shape
     return f"{width}&{height}&1&".encode() + np.nan_to_num(depth, nan=0.0).astype("<f4").tobytes()
 

@@ -17,9 +17,9 @@ from uni4d_fg.results.export.model import ExportJob
 from uni4d_fg.results.run import Run
 
 JPEG_QUALITY = 95
-MILLIMETRES = 1000.0
+MILLIMETERS = 1000.0
 MAX_PNG_DEPTH = 65.534
-"""Metres above which 16-bit millimetres do not reach (65535 is read as missing by many programs)."""
+"""Meters above which 16-bit millimeters do not reach (65535 is read as missing by many programs)."""
 
 _COPIED_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -60,7 +60,7 @@ def frame_names(run: Run) -> tuple[str, ...]:
 def write_images(job: ExportJob, folder: Path) -> list[str]:
     """Write every frame into ``folder``: files of the sequence are copied, frames of a video become JPEG.
 
-    A file is copied only if other programs see the same pixels in it as this one does: 8-bit colour.
+    A file is copied only if other programs see the same pixels in it as this one does: 8-bit color.
 
     Returns:
         The T file names, in frame order; sorting keeps it.
@@ -78,7 +78,7 @@ def write_images(job: ExportJob, folder: Path) -> list[str]:
     names = [f"{stem}{suffix}" for stem in frame_names(run)]
     for frame, name in enumerate(names):
         image, target = images[frame], folder / name
-        if paths and paths[frame].suffix == suffix and _is_plain_colour(paths[frame], image):
+        if paths and paths[frame].suffix == suffix and _is_plain_color(paths[frame], image):
             shutil.copyfile(paths[frame], target)
         else:
             target.write_bytes(encode(image, ".png" if suffix.lower() == ".png" else ".jpg", target))
@@ -86,7 +86,7 @@ def write_images(job: ExportJob, folder: Path) -> list[str]:
     return names
 
 
-def _is_plain_colour(path: Path, image: ImageArray) -> bool:
+def _is_plain_color(path: Path, image: ImageArray) -> bool:
     """Tell whether a reader that heeds orientation tags finds the same 8-bit RGB pixels in the file."""
     data = np.frombuffer(path.read_bytes(), np.uint8)
     raw, upright = cv2.imdecode(data, cv2.IMREAD_UNCHANGED), cv2.imdecode(data, cv2.IMREAD_COLOR)
@@ -118,8 +118,8 @@ def write_masks(job: ExportJob, folder: Path, names: list[str]) -> int:
 
 
 def depth_png(depth: Float32Array, path: Path) -> bytes:
-    """Return a depth map (H, W), metres, as a 16-bit PNG in millimetres; 0 where missing or beyond 65.5 m."""
+    """Return a depth map (H, W), meters, as a 16-bit PNG in millimeters; 0 where missing or beyond 65.5 m."""
     with np.errstate(invalid="ignore"):
         known = np.isfinite(depth) & (depth > 0.0) & (depth <= MAX_PNG_DEPTH)
-    millimetres = np.rint(np.where(known, depth, 0.0).astype(np.float64) * MILLIMETRES)
-    return encode(millimetres.astype(np.uint16), ".png", path)
+    millimeters = np.rint(np.where(known, depth, 0.0).astype(np.float64) * MILLIMETERS)
+    return encode(millimeters.astype(np.uint16), ".png", path)

@@ -1,4 +1,4 @@
-"""Line sets as binary PLY: vertices with colour and whole-number attributes, and edges between them."""
+"""Line sets as binary PLY: vertices with color and whole-number attributes, and edges between them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class LineSet:
     """N vertices and E edges."""
 
     points: FloatArray
-    """(N, 3) metres."""
+    """(N, 3) meters."""
     colors: ImageArray
     """(N, 3) RGB."""
     edges: npt.NDArray[np.signedinteger]

@@ -1,7 +1,7 @@
 """nerfstudio: ``transforms.json`` with ``images/``, optionally ``masks/`` and ``depths/``, and ``sparse_pc.ply``.
 
 Its camera axes are OpenGL's (x right, y up, z backward): the y and z columns of the rotation change sign. The ray
-of a pixel starts at its centre, (x + 0.5, y + 0.5): 0.5 is added to cx and cy
+of a pixel starts at its center, (x + 0.5, y + 0.5): 0.5 is added to cx and cy
 (https://docs.nerf.studio/quickstart/data_conventions.html). The world is not turned; nerfstudio orients and scales
 it itself, the points of the ``.ply`` with it.
 """
@@ -78,6 +78,6 @@ def _write_depth(job: ExportJob, folder: Path, stems: list[str], frames: list[di
         with np.errstate(invalid="ignore"):
             too_far += int((depth > MAX_PNG_DEPTH).sum())
         job.check()
-    job.facts.append("depths/: 16-bit PNG, millimetres, 0 missing")
+    job.facts.append("depths/: 16-bit PNG, millimeters, 0 missing")
     if too_far:
-        job.warnings.append(f"{too_far} pixels beyond {MAX_PNG_DEPTH} m do not fit into 16-bit millimetres: missing")
+        job.warnings.append(f"{too_far} pixels beyond {MAX_PNG_DEPTH} m do not fit into 16-bit millimeters: missing")

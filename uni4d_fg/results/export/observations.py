@@ -24,7 +24,7 @@ class StaticObservations:
     frame: IntArray
     """(N,)."""
     uv: FloatArray
-    """(N, 2) px, pixel centres at integers."""
+    """(N, 2) px, pixel centers at integers."""
     error: FloatArray
     """(N,) distance to the projected landmark, px."""
 

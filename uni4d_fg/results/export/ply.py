@@ -50,7 +50,7 @@ def trajectory_lines(result: Reconstruction) -> LineSet:
 
 
 def camera_lines(result: Reconstruction) -> LineSet:
-    """Return the path of the camera centre; a vertex is one frame."""
+    """Return the path of the camera center; a vertex is one frame."""
     frames = np.arange(result.num_frames)
     colors = np.tile(np.array([230, 60, 40], dtype=np.uint8), (result.num_frames, 1))
     edges = np.stack((frames[:-1], frames[1:]), axis=1)

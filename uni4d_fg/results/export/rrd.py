@@ -1,19 +1,19 @@
 """rerun: one recording with cameras and images, static and moving clouds, and trajectories on one time line.
 
-Entities, all below ``world`` (x right, y down, z forward, metres):
+Entities, all below ``world`` (x right, y down, z forward, meters):
 
 | entity | content | time |
 |---|---|---|
 | `world/camera` | pose | per frame |
 | `world/camera/image` | pinhole (static), JPEG | per frame |
-| `world/camera_path` | path of the camera centre | static |
+| `world/camera_path` | path of the camera center | static |
 | `world/static` | static cloud | static |
 | `world/dynamic` | cloud of what moves | per frame |
 | `world/trajectories` | the last steps of every moving point that is there | per frame |
 | `world/object_ID` | pose and axes of a rigid object, where it has one | per frame |
 
 Every frame has a place on the time lines ``frame`` (its number) and ``time`` (seconds since the first). rerun puts
-pixel centres at 0.5 (https://github.com/rerun-io/rerun/issues/3896): 0.5 is added to cx and cy.
+pixel centers at 0.5 (https://github.com/rerun-io/rerun/issues/3896): 0.5 is added to cx and cy.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def trails(result: Reconstruction, frame: int, length: int) -> tuple[list[Float3
 
     Returns:
         One strip (n, 3) of 2 to ``length`` + 1 positions for each trajectory that is there in this frame and the
-        one before it, oldest first, metres; and the rows of these trajectories.
+        one before it, oldest first, meters; and the rows of these trajectories.
     """
     window = result.dynamic_points[:, max(frame - length, 0) : frame + 1].astype(np.float32)
     # The newest positions without a gap: count known ones backwards from this frame.

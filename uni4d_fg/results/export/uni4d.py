@@ -2,7 +2,7 @@
 
 ``data/VIDEO/uni4d/uni4d_fg/%04d.npz`` per frame, ``fused_4d.npz`` beside them, and ``c2w.npy`` and ``depth_gt/`` in
 ``data/VIDEO`` where the truth is known, so that ``data`` serves as its ``--base_path`` and ``uni4d_fg`` as its
-``--experiment_name``. Conventions are ours: camera to world, OpenCV axes, pixel centres at integers. Two things are
+``--experiment_name``. Conventions are ours: camera to world, OpenCV axes, pixel centers at integers. Two things are
 not as that program writes them: the bottom row of ``c2w`` is (0, 0, 0, 1) instead of zeros, and a pixel without depth
 takes that of the nearest pixel with depth, because its files have no missing depth.
 """
@@ -65,10 +65,10 @@ def fill_depth(depth: Float32Array) -> tuple[Float32Array, int]:
     """Give every pixel without depth that of the nearest pixel with depth.
 
     Args:
-        depth: (H, W) metres, NaN where missing.
+        depth: (H, W) meters, NaN where missing.
 
     Returns:
-        (H, W) metres, 0 everywhere if nothing is known; and the number of pixels that were missing.
+        (H, W) meters, 0 everywhere if nothing is known; and the number of pixels that were missing.
     """
     missing = ~np.isfinite(depth)
     count = int(missing.sum())

@@ -1,4 +1,4 @@
-"""Coloured point clouds from images, fused depth and poses: one static, one dynamic per frame."""
+"""Colored point clouds from images, fused depth and poses: one static, one dynamic per frame."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _POINTS_BETWEEN_MERGES = 2_000_000
 
 
 class Cloud(NamedTuple):
-    """A coloured point cloud."""
+    """A colored point cloud."""
 
     points: FloatArray
-    """(N, 3) world positions, metres."""
+    """(N, 3) world positions, meters."""
     colors: ImageArray
     """(N, 3) RGB."""
 
@@ -46,10 +46,10 @@ def static_cloud(
 
     Args:
         images: T images (H, W, 3), RGB.
-        depths: T maps (H, W), metres, NaN where missing.
+        depths: T maps (H, W), meters, NaN where missing.
         masks: T label maps (H, W), 0 static.
         intrinsics: (4,) fx, fy, cx, cy, px.
-        world_T_cam: (T, 4, 4) camera to world, metres.
+        world_T_cam: (T, 4, 4) camera to world, meters.
         config: Strides, voxel size and edge threshold.
         band_px: Width of the band around instances, px.
         lens: Distortion of the images.
@@ -123,7 +123,7 @@ def lift(
 
 
 def depth_edges(depth: Float32Array, relative_gradient: float) -> BoolArray:
-    """Return the pixels (H, W) whose depth differs from a neighbour's by more than this part of the smaller one.
+    """Return the pixels (H, W) whose depth differs from a neighbor's by more than this part of the smaller one.
 
     Both pixels of a pair are marked: depth that mixes two surfaces may lie on either side of the edge.
     """
@@ -150,7 +150,7 @@ def dilate(mask: BoolArray, radius_px: int) -> BoolArray:
 
 
 def merge_voxels(cloud: Cloud, voxel_m: float) -> Cloud:
-    """Average positions and colours within cubes of side ``voxel_m``; 0 keeps every point.
+    """Average positions and colors within cubes of side ``voxel_m``; 0 keeps every point.
 
     Raises:
         MissingDependencyError: If Open3D cannot be loaded.

@@ -74,7 +74,7 @@ def densify_frame(
             continue
         anchors = unproject(intrinsics, control.uv[mine], control.cue[mine])
         scale = _smooth(anchors, control.log_scale[mine], config.smoothing)
-        field = _interpolate(nodes, anchors, scale, frame_log_scale, config.neighbours)
+        field = _interpolate(nodes, anchors, scale, frame_log_scale, config.neighbors)
         pixels = mask == label
         dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
         out[pixels] = depth[pixels] * np.exp(dense[pixels])
@@ -82,10 +82,10 @@ def densify_frame(
 
 
 def _grid(depth: Float32Array, intrinsics: FloatArray, stride: int) -> FloatArray:
-    """Lift the centres of stride x stride cells, (rows, columns, 3); NaN where a cell has no depth."""
+    """Lift the centers of stride x stride cells, (rows, columns, 3); NaN where a cell has no depth."""
     height, width = depth.shape
     rows, columns = -(-height // stride), -(-width // stride)
-    # Centres as cv2.resize places them, so that its bilinear interpolation has no shift.
+    # Centers as cv2.resize places them, so that its bilinear interpolation has no shift.
     v = (np.arange(rows) + 0.5) * height / rows - 0.5
     u = (np.arange(columns) + 0.5) * width / columns - 0.5
     uu, vv = np.meshgrid(u, v)

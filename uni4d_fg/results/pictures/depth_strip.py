@@ -31,13 +31,13 @@ def draw_depth_strip(
 ) -> None:
     """Draw a few frames as PNG, in columns: image, depth cue, fused depth, and the change between the two.
 
-    Cue and fused depth share one colour range (the central 96 % of the depths shown); missing depth is grey.
+    Cue and fused depth share one color range (the central 96 % of the depths shown); missing depth is gray.
 
     Args:
         path: The ``.png`` file.
         images: T images (H, W, 3), RGB.
-        cue: T maps (H, W), metres, NaN where missing.
-        fused: T maps (H, W), metres, NaN where missing.
+        cue: T maps (H, W), meters, NaN where missing.
+        fused: T maps (H, W), meters, NaN where missing.
         columns: Number of frames shown, evenly spread.
         unit: Name of the unit of depth.
 
@@ -100,7 +100,7 @@ def _change_range(maps: list[np.ndarray]) -> Normalize:
 
 
 def _label_depths(axis: Axes, norm: LogNorm) -> None:
-    """Put round numbers on a logarithmic colour bar."""
+    """Put round numbers on a logarithmic color bar."""
     low, high = float(norm.vmin or 1.0), float(norm.vmax or 2.0)
     inside: list[float] = []
     for mantissas in ((1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), tuple(np.arange(1.0, 10.0, 0.25))):

@@ -40,7 +40,7 @@ def draw_scene(
     Args:
         path: The ``.png`` file.
         reconstruction: Cameras and dynamic trajectories.
-        static: Points (N, 3), metres, and RGB (N, 3) of the static cloud.
+        static: Points (N, 3), meters, and RGB (N, 3) of the static cloud.
         dynamic: Returns the same for the moving instances of a frame.
         panels: Number of times shown, evenly spread.
         trail_frames: Length of the moving points' trails, frames.
@@ -82,7 +82,7 @@ def _thin(points: FloatArray, colors: ImageArray) -> tuple[FloatArray, ImageArra
 
 
 def _sizes(points: FloatArray) -> FloatArray:
-    """Return the diameters (N,), metres, at which neighbouring points of a cloud just touch."""
+    """Return the diameters (N,), meters, at which neighboring points of a cloud just touch."""
     if len(points) < 5:
         return np.full(len(points), 0.01)
     distance, _ = cKDTree(points).query(points, k=5, workers=-1)
@@ -96,17 +96,17 @@ def _view(reconstruction: Reconstruction, points: FloatArray) -> View:
     poses = reconstruction.world_T_cam
     axes = upright_axes(poses)
     forward, up = axes[1], axes[2]
-    centre = poses[:, :3, 3].mean(axis=0)
+    center = poses[:, :3, 3].mean(axis=0)
     seen = points if len(points) else reconstruction.dynamic_points.reshape(-1, 3)
     seen = seen[np.isfinite(seen).all(axis=1)]
-    target = np.median(seen, axis=0) if len(seen) else centre + 2.0 * forward
-    distance = max(float(np.linalg.norm(target - centre)), 1e-3)
+    target = np.median(seen, axis=0) if len(seen) else center + 2.0 * forward
+    distance = max(float(np.linalg.norm(target - center)), 1e-3)
     # Keep the gaze level with the floor: only the elevation below tilts it.
     angle = np.radians(_ELEVATION_DEG)
-    gaze = target - centre
+    gaze = target - center
     gaze = gaze - (gaze @ up) * up
     gaze = gaze / np.linalg.norm(gaze) if np.linalg.norm(gaze) > 1e-6 * distance else forward
-    target = target + 0.2 * (centre - target)
+    target = target + 0.2 * (center - target)
     eye = target - 1.9 * distance * (np.cos(angle) * gaze - np.sin(angle) * up)
     moving = reconstruction.dynamic_points.reshape(-1, 3)
     moving = moving[np.isfinite(moving).all(axis=1)]
@@ -129,12 +129,12 @@ def _framed(world_T_cam: FloatArray, clouds: list[FloatArray], cameras: FloatArr
     high = np.max([corner[1] for corner in corners], axis=0)
     extent = np.maximum(high - low, 1e-3)
     focal = (1.0 - 2.0 * _MARGIN) * float(np.min(np.array([width, height]) / extent))
-    centre = 0.5 * np.array([width - 1, height - 1]) - focal * 0.5 * (low + high)
-    return View(world_T_cam, np.array([focal, focal, *centre]), _PANEL)
+    center = 0.5 * np.array([width - 1, height - 1]) - focal * 0.5 * (low + high)
+    return View(world_T_cam, np.array([focal, focal, *center]), _PANEL)
 
 
 def _trails(reconstruction: Reconstruction) -> tuple[FloatArray, FloatArray]:
-    """Return up to _MAX_TRAILS trajectories (M, T, 3) and their RGB (M, 3), neighbours in like colours."""
+    """Return up to _MAX_TRAILS trajectories (M, T, 3) and their RGB (M, 3), neighbors in like colors."""
     points = reconstruction.dynamic_points
     chosen = evenly_spread(len(points), _MAX_TRAILS)
     points = points[chosen]

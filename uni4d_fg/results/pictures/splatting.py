@@ -58,13 +58,13 @@ def render(
 
     Args:
         view: Virtual camera.
-        points: (N, 3) world positions, metres.
+        points: (N, 3) world positions, meters.
         colors: (N, 3) RGB.
-        point_size_m: (N,) diameter of each point, metres.
+        point_size_m: (N,) diameter of each point, meters.
         background: RGB where there is no point.
 
     Returns:
-        Image (H, W, 3) and depth (H, W), metres, infinite where there is no point.
+        Image (H, W, 3) and depth (H, W), meters, infinite where there is no point.
     """
     fine = view.scaled(2)
     color, depth = _splat(fine, points, colors, point_size_m)
@@ -78,7 +78,7 @@ def render(
 def _splat(
     view: View, points: FloatArray, colors: ImageArray, point_size_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return colour (H, W, 3) and depth (H, W) of the nearest disc in each pixel."""
+    """Return color (H, W, 3) and depth (H, W) of the nearest disc in each pixel."""
     height, width = view.image_size
     uv, z = view.project(points)
     column, row = np.rint(np.nan_to_num(uv, nan=-1e6)).clip(-1e6, 1e6).astype(np.int64).T
@@ -106,7 +106,7 @@ def _splat(
 
 
 def _edge_shading(depth: FloatArray) -> FloatArray:
-    """Darken pixels that lie behind their neighbours (eye-dome lighting): factors (H, W) in (0, 1]."""
+    """Darken pixels that lie behind their neighbors (eye-dome lighting): factors (H, W) in (0, 1]."""
     log_depth = np.where(np.isfinite(depth), np.log(np.where(np.isfinite(depth), depth, 1.0)), np.nan)
     total = np.zeros(depth.shape)
     for shift in (1, 3):

@@ -28,7 +28,7 @@ def draw_trajectory(
         world_T_cam: (T, 4, 4) estimated camera to world.
         ground_truth: (T, 4, 4) true poses, NaN where unknown; if given, the estimate is first aligned to
             them with Sim(3), and the errors stand in the title.
-        unit: Name of the estimate's unit of length; after alignment it is the truth's, metres.
+        unit: Name of the estimate's unit of length; after alignment it is the truth's, meters.
 
     Raises:
         OutputError: If the file cannot be written.
@@ -53,7 +53,7 @@ def draw_trajectory(
     figure = new_figure(11.0, 5.6)
     figure.suptitle(title, color=INK, fontsize=13, x=0.02, ha="left")
     everything = estimate if reference is None else np.concatenate((estimate, reference))
-    centre = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
+    center = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     half = 0.58 * max(float(np.ptp(everything, axis=0).max()), _MIN_EXTENT_M)
     right, forward, up = (f"{axis} [{unit}]" for axis in ("right", "forward", "up"))
     panels = (("Top view", 0, 1, right, forward), ("Side view", 1, 2, forward, up))
@@ -66,8 +66,8 @@ def draw_trajectory(
                 reference[:, i], reference[:, j], color=INK, linewidth=1.2, linestyle=(0, (4, 2)), label="ground truth"
             )
         lines = _draw_path(panel, estimate[:, (i, j)], direction[:, (i, j)], 0.09 * half)
-        panel.set_xlim(centre[i] - half, centre[i] + half)
-        panel.set_ylim(centre[j] - half, centre[j] + half)
+        panel.set_xlim(center[i] - half, center[i] + half)
+        panel.set_ylim(center[j] - half, center[j] + half)
         panel.set_aspect("equal")
         panel.legend(frameon=False, fontsize=9, labelcolor=INK, loc="best")
     if lines is not None:
@@ -91,7 +91,7 @@ def _style(panel: Axes, name: str, label_x: str, label_y: str) -> None:
 
 
 def _draw_path(panel: Axes, points: FloatArray, direction: FloatArray, arrow: float) -> LineCollection | None:
-    """Draw one projected path (T, 2), coloured by frame, with the viewing direction of some frames."""
+    """Draw one projected path (T, 2), colored by frame, with the viewing direction of some frames."""
     count = len(points)
     chosen = evenly_spread(count, _VIEW_ARROWS)
     rays = np.stack((points[chosen], points[chosen] + arrow * direction[chosen]), axis=1)

@@ -44,7 +44,7 @@ def trajectory(run: Run) -> Markup:
     extent = np.ptp(path, axis=0)
     text = (
         f"The camera travels {steps.sum():.3g} {unit} within a box of {extent[0]:.3g} × {extent[1]:.3g} × "
-        f"{extent[2]:.3g} {unit} (right, forward, up). The circle is the first frame; colour goes from violet (first) "
+        f"{extent[2]:.3g} {unit} (right, forward, up). The circle is the first frame; color goes from violet (first) "
         "to yellow (last)."
     )
     if true_path is not None:
@@ -55,25 +55,25 @@ def trajectory(run: Run) -> Markup:
 def _plan(
     identifier: str, title: str, path: FloatArray, truth: FloatArray | None, label_x: str, label_y: str
 ) -> Markup:
-    """Draw a path (T, 2) with equal axes, coloured by frame."""
+    """Draw a path (T, 2) with equal axes, colored by frame."""
     everything = path if truth is None else np.concatenate((path, truth))
     low, high = everything.min(axis=0), everything.max(axis=0)
     half = 0.56 * max(float((high - low).max()), _MIN_EXTENT)
-    centre = 0.5 * (low + high)
+    center = 0.5 * (low + high)
     side = _SIZE - _LEFT - _MARGIN
 
     def at(point: FloatArray) -> tuple[float, float]:
-        x, y = (point - centre + half) / (2.0 * half)
+        x, y = (point - center + half) / (2.0 * half)
         return _LEFT + x * side, _MARGIN + (1.0 - y) * side
 
     parts: list[Markup] = []
-    for value in nice_ticks(centre[0] - half, centre[0] + half, count=4):
-        x = at(np.array([value, centre[1]]))[0]
+    for value in nice_ticks(center[0] - half, center[0] + half, count=4):
+        x = at(np.array([value, center[1]]))[0]
         parts.append(element("line", x1=f"{x:.1f}", x2=f"{x:.1f}", y1=_MARGIN, y2=_MARGIN + side, class_="grid"))
         place: dict[str, str | int] = {"x": f"{x:.1f}", "y": _MARGIN + side + 16}
         parts.append(element("text", _tick(value), **place, text_anchor="middle", class_="tick"))
-    for value in nice_ticks(centre[1] - half, centre[1] + half, count=4):
-        y = at(np.array([centre[0], value]))[1]
+    for value in nice_ticks(center[1] - half, center[1] + half, count=4):
+        y = at(np.array([center[0], value]))[1]
         parts.append(element("line", x1=_LEFT, x2=_LEFT + side, y1=f"{y:.1f}", y2=f"{y:.1f}", class_="grid"))
         parts.append(element("text", _tick(value), x=_LEFT - 6, y=f"{y + 4:.1f}", text_anchor="end", class_="tick"))
     parts.append(element("text", label_x, x=_LEFT + side / 2, y=_MARGIN + side + 34, text_anchor="middle"))
@@ -129,7 +129,7 @@ def uncertainty(run: Run) -> Markup:
     ]  # fmt: skip
     text = (
         "Marginal standard deviations relative to the first camera, which is held. They allow for errors that "
-        "neighbouring tracks share, not for those of the whole image, such as a distortion of the lens."
+        "neighboring tracks share, not for those of the whole image, such as a distortion of the lens."
     )
     facts = []
     covariance = run.reconstruction.intrinsics_covariance

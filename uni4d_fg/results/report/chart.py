@@ -1,4 +1,4 @@
-"""Line charts as inline SVG that take their colours from the page."""
+"""Line charts as inline SVG that take their colors from the page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Line:
 def line_chart(
     identifier: str, title: str, lines: Sequence[Line], *, x_label: str, y_label: str, log: bool = False
 ) -> Markup:
-    """Draw curves over a common x axis, told apart by colour and by dashes.
+    """Draw curves over a common x axis, told apart by color and by dashes.
 
     Args:
         identifier: Unique in the page; ids in the chart begin with it.

@@ -51,7 +51,7 @@ def _strips(run: Run) -> list[Markup]:
         out += [element("h3", name), element("div", *tiles, class_="strip", style=style)]
     near, far = (f"{bound:.3g} {run.unit}" for bound in bounds)
     out.append(color_bar(depth_gradient(), near, far, "Depth"))
-    out.append(element("p", "Both rows share the colours, which are logarithmic. Grey: no depth.", class_="muted"))
+    out.append(element("p", "Both rows share the colors, which are logarithmic. Gray: no depth.", class_="muted"))
     return out
 
 

@@ -33,7 +33,7 @@ def _own_warnings(run: Run) -> Iterator[str]:
     cues = run.summary.get("cues")
     warnings = list(map(_sentence, cues.get("warnings", []))) if isinstance(cues, dict) else []
     if not run.is_metric and not any("not metric" in text for text in warnings):
-        yield "Depth is not metric: all lengths are up to one unknown scale, also where a number looks like metres."
+        yield "Depth is not metric: all lengths are up to one unknown scale, also where a number looks like meters."
     # That lengths have no unit concerns every number below it.
     yield from sorted(warnings, key=lambda text: "not metric" not in text)
     yield from map(_sentence, run.summary.get("warnings", []))

@@ -1,4 +1,4 @@
-"""What every stage minimised: energy per term at the start and at the end, and against iterations."""
+"""What every stage minimized: energy per term at the start and at the end, and against iterations."""
 
 from __future__ import annotations
 

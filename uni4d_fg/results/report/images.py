@@ -1,4 +1,4 @@
-"""The pictures of the page: depth as colour, and residuals drawn on frames."""
+"""The pictures of the page: depth as color, and residuals drawn on frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MIN_MAP_WIDTH = 480
 
 
 def depth_picture(depth: Float32Array, bounds: tuple[float, float], width: int) -> ImageArray:
-    """Return depth (H, W) as colours, logarithmic, near red and far blue, missing grey."""
+    """Return depth (H, W) as colors, logarithmic, near red and far blue, missing gray."""
     height = max(1, round(depth.shape[0] * width / depth.shape[1]))
     if depth.shape[1] > width:
         depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
@@ -27,7 +27,7 @@ def depth_picture(depth: Float32Array, bounds: tuple[float, float], width: int) 
 
 
 def depth_gradient() -> str:
-    """Return the colours of :func:`depth_picture` from near to far as a CSS gradient."""
+    """Return the colors of :func:`depth_picture` from near to far as a CSS gradient."""
     return css_stops(np.rint(255.0 * matplotlib.colormaps["turbo_r"](np.linspace(0.0, 1.0, 9))[:, :3]).astype(np.uint8))
 
 
@@ -40,9 +40,9 @@ def residual_picture(
     bounds: tuple[float, float],
     width: int,
 ) -> ImageArray:
-    """Draw the observations of a frame on its image, darkened and without colour.
+    """Draw the observations of a frame on its image, darkened and without color.
 
-    Static points are discs, moving ones squares, coloured by residual; tracks that were not used are grey crosses.
+    Static points are discs, moving ones squares, colored by residual; tracks that were not used are gray crosses.
 
     Args:
         image: (H, W, 3) RGB.
@@ -50,7 +50,7 @@ def residual_picture(
         norm: (N,) residuals, px.
         is_dynamic: (N,).
         unused_uv: (U, 2) pixels of tracks without a point.
-        bounds: Residuals at the ends of the colours, px.
+        bounds: Residuals at the ends of the colors, px.
         width: Largest width of the result, px; small images are enlarged.
     """
     small = thumbnail(image, width)
@@ -58,11 +58,11 @@ def residual_picture(
         # Marks have a size of their own, which would cover a small image.
         height = round(small.shape[0] * _MIN_MAP_WIDTH / small.shape[1])
         small = np.asarray(cv2.resize(small, (_MIN_MAP_WIDTH, height), interpolation=cv2.INTER_LINEAR))
-    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    canvas = np.repeat((0.55 * grey).astype(np.uint8)[..., None], 3, axis=2)
+    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    canvas = np.repeat((0.55 * gray).astype(np.uint8)[..., None], 3, axis=2)
     scale = small.shape[1] / image.shape[1]
 
-    # Pixel centres are integers in both images, which shifts them by half a pixel each way.
+    # Pixel centers are integers in both images, which shifts them by half a pixel each way.
     def place(points: FloatArray) -> list[tuple[int, int]]:
         return [(round(x), round(y)) for x, y in ((points + 0.5) * scale - 0.5).tolist()]
 

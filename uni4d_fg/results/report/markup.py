@@ -77,7 +77,7 @@ def picture(image: ImageArray, alternative: str, *, quality: int = 82) -> Markup
 
 
 def color_bar(gradient: str, low: str, high: str, label: str) -> Markup:
-    """Return a colour bar: a CSS gradient between two labelled ends."""
+    """Return a color bar: a CSS gradient between two labelled ends."""
     return element(
         "div",
         element("span", f"{label}: {low}"),

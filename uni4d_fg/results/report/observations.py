@@ -67,7 +67,7 @@ def _maps(run: Run, residuals: Residuals) -> list[Markup]:
         element("h3", "Residual maps"),
         color_bar(css_gradient(), "0 px", f"{bounds[1]:.2g} px and more", "Residual"),
         element("div", *shown, class_="maps"),
-        element("p", "Discs: static points. Squares: moving points. Grey crosses: tracks not used.", class_="muted"),
+        element("p", "Discs: static points. Squares: moving points. Gray crosses: tracks not used.", class_="muted"),
     ]
 
 

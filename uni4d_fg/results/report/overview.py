@@ -44,7 +44,7 @@ def _facts(run: Run) -> Markup:
         "Principal point": f"cx {cx:.1f}, cy {cy:.1f} px",
         "Static landmarks": str(len(reconstruction.landmarks)),
         "Moving trajectories": str(len(reconstruction.dynamic_points)),
-        "Unit of lengths": "metres of the depth cue" if run.is_metric else "unknown (not metric)",
+        "Unit of lengths": "meters of the depth cue" if run.is_metric else "unknown (not metric)",
     }
     return element(
         "dl", *(element("div", element("dt", name), element("dd", value)) for name, value in facts.items()),

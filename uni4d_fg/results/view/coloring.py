@@ -1,4 +1,4 @@
-"""What the colours of the viewer mean: by image, instance, residual or uncertainty."""
+"""What the colors of the viewer mean: by image, instance, residual or uncertainty."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.results.colors import (
     BRIDGED_AMBER,
-    STATIC_GREY,
+    STATIC_GRAY,
     css_gradient,
     instance_colors,
     value_colors,
@@ -28,7 +28,7 @@ _CAMERA = (88, 130, 190)
 
 
 class ColorBy(str, Enum):
-    """What colours show."""
+    """What colors show."""
 
     image = "image"
     instance = "instance"
@@ -38,22 +38,22 @@ class ColorBy(str, Enum):
 
 @dataclass(frozen=True)
 class Values:
-    """The numbers behind the colours."""
+    """The numbers behind the colors."""
 
     landmark_error: FloatArray
     """(N,) median reprojection error, px."""
     landmark_sigma: FloatArray
-    """(N,) metres, from the rays alone; infinite where not determined, NaN without tracks."""
+    """(N,) meters, from the rays alone; infinite where not determined, NaN without tracks."""
     trajectory_error: FloatArray
     """(M, T) reprojection residual, px; NaN where not observed."""
     position_sigma: FloatArray
-    """(T,) metres; NaN where not known."""
+    """(T,) meters; NaN where not known."""
     camera_error: FloatArray
     """(T,) median reprojection residual of the static points, px; NaN where not known."""
 
 
 def values_of(run: Run) -> Values:
-    """Compute the numbers behind the colours of a run."""
+    """Compute the numbers behind the colors of a run."""
     reconstruction = run.reconstruction
     num_frames = reconstruction.num_frames
     sigmas = pose_sigmas(reconstruction)
@@ -72,35 +72,35 @@ def values_of(run: Run) -> Values:
 
 @dataclass(frozen=True)
 class Coloring:
-    """Colours of everything that is drawn, for one choice of what they show."""
+    """Colors of everything that is drawn, for one choice of what they show."""
 
     by: ColorBy
     run: Run
     values: Values
 
     def cloud(self, cloud: ColoredPoints) -> ImageArray:
-        """Colours of a dense cloud; it has no residual of its own, and steps back where points are judged."""
+        """Colors of a dense cloud; it has no residual of its own, and steps back where points are judged."""
         if self.by is ColorBy.image:
             return cloud.colors
         if self.by is ColorBy.instance:
             # Shaded by the image, so that shapes stay readable.
             shade = 0.45 + 0.55 * cloud.colors.astype(np.float64).mean(axis=1, keepdims=True) / 255.0
             return np.asarray(np.rint(instance_colors(cloud.instance) * shade), dtype=np.uint8)
-        grey = _DIMMED * cloud.colors.astype(np.float64).mean(axis=1, keepdims=True)
-        return np.asarray(np.rint(np.repeat(grey, 3, axis=1)), dtype=np.uint8)
+        gray = _DIMMED * cloud.colors.astype(np.float64).mean(axis=1, keepdims=True)
+        return np.asarray(np.rint(np.repeat(gray, 3, axis=1)), dtype=np.uint8)
 
     def landmarks(self) -> ImageArray:
-        """(N, 3) colours of the landmarks."""
+        """(N, 3) colors of the landmarks."""
         reconstruction = self.run.reconstruction
         if self.by is ColorBy.image:
             return reconstruction.landmark_color
         if self.by is ColorBy.instance:
-            return np.full(reconstruction.landmark_color.shape, STATIC_GREY, np.uint8)
+            return np.full(reconstruction.landmark_color.shape, STATIC_GRAY, np.uint8)
         values = self.values.landmark_error if self.by is ColorBy.residual else self.values.landmark_sigma
         return value_colors(values, value_range(values))
 
     def trajectories(self, frame: int) -> ImageArray:
-        """(M, 3) colours of the trajectories in one frame."""
+        """(M, 3) colors of the trajectories in one frame."""
         reconstruction = self.run.reconstruction
         if self.by is ColorBy.image:
             return reconstruction.dynamic_color
@@ -108,12 +108,12 @@ class Coloring:
             return instance_colors(reconstruction.dynamic_instance)
         if self.by is ColorBy.residual:
             return value_colors(self.values.trajectory_error[:, frame], value_range(self.values.trajectory_error))
-        colors = np.full(reconstruction.dynamic_color.shape, STATIC_GREY, np.uint8)
+        colors = np.full(reconstruction.dynamic_color.shape, STATIC_GRAY, np.uint8)
         colors[~reconstruction.dynamic_observed[:, frame]] = BRIDGED_AMBER
         return colors
 
     def cameras(self) -> ImageArray:
-        """(T, 3) colours of the cameras."""
+        """(T, 3) colors of the cameras."""
         if self.by is ColorBy.residual:
             return value_colors(self.values.camera_error, value_range(self.values.camera_error))
         if self.by is ColorBy.uncertainty:
@@ -121,12 +121,12 @@ class Coloring:
         return np.full((self.run.num_frames, 3), _CAMERA, np.uint8)
 
     def legend(self) -> str:
-        """HTML that says what the colours mean."""
+        """HTML that says what the colors mean."""
         if self.by is ColorBy.image:
-            return _note("Colours of the video.")
+            return _note("Colors of the video.")
         if self.by is ColorBy.instance:
             ids = np.unique(self.run.reconstruction.dynamic_instance).tolist()
-            entries = [("static", STATIC_GREY)]
+            entries = [("static", STATIC_GRAY)]
             entries += [(f"instance {i}", tuple(instance_colors(np.array([i], np.int32))[0].tolist())) for i in ids]
             return "".join(_swatch(name, color) for name, color in entries)
         values = self.values

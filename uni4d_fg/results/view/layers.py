@@ -172,9 +172,9 @@ class CameraLayer:
             image = self._image(frame, self.limits.image_width) if frame in with_image else None
             size = _OTHER_SIZE * self.size
             self._nodes[frame] = self._frustum(f"/cameras/{frame:05d}", frame, image, size, _OTHER_WIDTH)
-        centres = self.run.reconstruction.world_T_cam[:, :3, 3].astype(np.float32)
-        if len(centres) > 1:
-            steps = np.stack((centres[:-1], centres[1:]), axis=1)
+        centers = self.run.reconstruction.world_T_cam[:, :3, 3].astype(np.float32)
+        if len(centers) > 1:
+            steps = np.stack((centers[:-1], centers[1:]), axis=1)
             self._path = self.server.scene.add_line_segments(
                 "/camera_path", steps, np.full_like(steps, 150).astype(np.uint8), thickness=1.5,
                 thickness_units="screen",
@@ -182,7 +182,7 @@ class CameraLayer:
         self.color(coloring)
 
     def color(self, coloring: Coloring) -> None:
-        """Give the frusta their colours."""
+        """Give the frusta their colors."""
         colors = coloring.cameras()
         for frame, node in self._nodes.items():
             node.color = tuple(colors[frame].tolist())

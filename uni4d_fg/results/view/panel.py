@@ -25,8 +25,8 @@ class Panel:
                 "Frames per second", min=1, max=60, step=1, initial_value=round(min(max(frames_per_second, 1), 60))
             )
             self.facts = gui.add_html("")
-        with gui.add_folder("Colour"):
-            self.color = gui.add_dropdown("Colour by", options=tuple(choice.value for choice in ColorBy))
+        with gui.add_folder("Color"):
+            self.color = gui.add_dropdown("Color by", options=tuple(choice.value for choice in ColorBy))
             self.point_size = gui.add_slider("Point size", min=0.2, max=5.0, step=0.1, initial_value=1.0)
             self.legend = gui.add_html("")
         with gui.add_folder("Show"):
@@ -53,7 +53,7 @@ class Panel:
 
     @property
     def color_by(self) -> ColorBy:
-        """What colours shall show."""
+        """What colors shall show."""
         return ColorBy(self.color.value)
 
     def shown(self) -> Shown:

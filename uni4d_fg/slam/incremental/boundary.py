@@ -27,7 +27,7 @@ class CheckedFrame(NamedTuple):
     image: ImageArray
     """(H, W, 3) or (H, W) uint8."""
     depth: Float32Array
-    """(H, W) metres, NaN where missing."""
+    """(H, W) meters, NaN where missing."""
     mask: Int32Array
     """(H, W)."""
     tracks: FrameTracks | None
@@ -61,7 +61,7 @@ class Boundary:
         where = f"frame {number}"
         time = self._time(where, number if timestamp is None else timestamp)
         frame = CheckedFrame(
-            checked_image(image, self.image_size, f"{where}: image", grey=True).copy(),
+            checked_image(image, self.image_size, f"{where}: image", gray=True).copy(),
             checked_depth(depth, self.image_size, f"{where}: depth"),
             np.zeros(self.image_size, np.int32)
             if mask is None

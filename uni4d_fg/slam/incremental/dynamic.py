@@ -63,7 +63,7 @@ class DynamicWindow:
             self._keep(~np.isin(self.observations.track, track))
 
     def rescale(self, log_scale: float) -> None:
-        """Scale what is seen when the world turns out to have other metres."""
+        """Scale what is seen when the world turns out to have other meters."""
         self.observations = replace(self.observations, depth=self.observations.depth * np.exp(log_scale))
 
     def solve(
@@ -115,7 +115,7 @@ def in_world(points: DynamicPoints, world_T_cam: FloatArray) -> DynamicPoints:
 
 def moving_scales(
     static: LabelledFrame, points: FloatArray, moving: LabelledFrame, world_T_cam: FloatArray, log_scale: float,
-    neighbours: int, samples: int,
+    neighbors: int, samples: int,
 ) -> tuple[FloatArray, float]:  # fmt: skip
     """Return the cue's log-scale (m,) at moving observations of one frame and its sigma (NaN without landmarks).
 
@@ -125,7 +125,7 @@ def moving_scales(
         moving: m moving observations.
         world_T_cam: (4, 4).
         log_scale: The frame's own.
-        neighbours: Static observations per prediction, see :mod:`uni4d_fg.slam.stages.local_scale`.
+        neighbors: Static observations per prediction, see :mod:`uni4d_fg.slam.stages.local_scale`.
         samples: Static observations on which the prediction is measured, at most.
     """
     z = world_to_camera(np.broadcast_to(world_T_cam, (len(points), 4, 4)), points)[:, 2]
@@ -139,5 +139,5 @@ def moving_scales(
         moving.track, np.zeros(len(moving.track), dtype=np.int64), moving.uv, moving.depth, moving.weight
     )
     observations = Observations(static.track, zero, static.uv, static.depth, static.weight)
-    local = predict_log_scale(observations, measured, np.array([log_scale]), queries, neighbours, samples)
+    local = predict_log_scale(observations, measured, np.array([log_scale]), queries, neighbors, samples)
     return local.log_scale, local.sigma

@@ -91,7 +91,7 @@ class TrackBook:
         return LabelledFrame(track[keep], uv[keep], cue.astype(np.float64), weight[keep], label[keep], track[broken])
 
     def colors(self, track: IntArray) -> ImageArray:
-        """Return the colours (n, 3) of tracks; black for forgotten ones."""
+        """Return the colors (n, 3) of tracks; black for forgotten ones."""
         out = np.zeros((len(track), 3), dtype=np.uint8)
         if len(self.track):
             at = np.minimum(np.searchsorted(self.track, track), len(self.track) - 1)

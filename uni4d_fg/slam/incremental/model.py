@@ -60,7 +60,7 @@ class DynamicPoints:
     instance: IntArray
     """(m,) mask ids."""
     point: FloatArray
-    """(m, 3) metres."""
+    """(m, 3) meters."""
     observed: BoolArray
     """(m,) False where a hidden point was bridged."""
     color: ImageArray
@@ -80,7 +80,7 @@ class Landmarks:
     track: IntArray
     """(n,)."""
     point: FloatArray
-    """(n, 3) world, metres."""
+    """(n, 3) world, meters."""
     error: FloatArray
     """(n,) median reprojection error, px."""
     count: IntArray

@@ -124,8 +124,8 @@ class IncrementalReconstructor:
         """Take the next frame.
 
         Args:
-            image: (H, W, 3) uint8 RGB, or (H, W) grey.
-            depth: (H, W) metres, NaN, 0 or negative where missing.
+            image: (H, W, 3) uint8 RGB, or (H, W) gray.
+            depth: (H, W) meters, NaN, 0 or negative where missing.
             mask: (H, W) 0 static, > 0 instance that may move; all static when None.
             tracks: Points tracked to this frame; None tracks online.
             timestamp: Seconds, increasing; the number of the frame when None. A frame at the time of the last one,
@@ -176,7 +176,7 @@ class IncrementalReconstructor:
                 with self._timed("marginalize"):
                     oldest, gone = self.window.slide()
                 left.append((oldest.frame, oldest.world_T_cam, oldest.covariance, oldest.log_scale))
-                landmarks.append(self._coloured(gone))
+                landmarks.append(self._colored(gone))
         self.last_pose = self._pose_of(self.pending[-1])
         with self._timed("nonrigid"):
             dynamic = self._solve_dynamic(frame, static, moving)
@@ -211,7 +211,7 @@ class IncrementalReconstructor:
         ]
         landmarks: tuple[Landmarks, ...] = ()
         if len(window.landmark_track):
-            landmarks = (self._coloured(window.all_landmarks()),)
+            landmarks = (self._colored(window.all_landmarks()),)
         self.results.add(tuple(frames), landmarks)
         self.pending = []
         self.window = CameraWindow(
@@ -320,10 +320,10 @@ class IncrementalReconstructor:
         """Add the moving observations of the newest frame and solve their window; return its points in the world."""
         newest = self.pending[-1]
         log_scale = newest.log_scale if newest.status is FrameStatus.TRACKED else float(self.window.log_scale[-1])
-        neighbours = self.config.nonrigid.local_scale_neighbours
+        neighbors = self.config.nonrigid.local_scale_neighbors
         samples = self.config.nonrigid.local_scale_samples
         _, points = self.window.landmarks_of(static.track)
-        scales, sigma = moving_scales(static, points, moving, self.last_pose, log_scale, neighbours, samples)
+        scales, sigma = moving_scales(static, points, moving, self.last_pose, log_scale, neighbors, samples)
         if np.isfinite(sigma):
             floor, part = self.config.bundle_adjustment.min_depth_sigma, self.config.incremental.noise_smoothing
             self.dynamic.depth_sigma += part * (max(sigma, floor) - self.dynamic.depth_sigma)
@@ -358,7 +358,7 @@ class IncrementalReconstructor:
                 in_world(pending.dynamic, pose),
             )
 
-    def _coloured(self, left: LeftLandmarks) -> Landmarks:
+    def _colored(self, left: LeftLandmarks) -> Landmarks:
         return Landmarks(left.track, left.point, left.error, left.count, self.book.colors(left.track))
 
     def _forget(self, frame: int) -> None:

@@ -27,7 +27,7 @@ class OnlineTracker:
     config: TrackingConfig
     max_tracks: int
     previous: ImageArray | None = None
-    """(H, W) the last image, grey."""
+    """(H, W) the last image, gray."""
     track: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
     next_track: int = 0
@@ -35,17 +35,17 @@ class OnlineTracker:
 
     def advance(self, image: ImageArray) -> FrameTracks:
         """Follow the points to the next image (H, W, 3) or (H, W) uint8 and start new ones where there are none."""
-        grey: ImageArray = np.ascontiguousarray(
+        gray: ImageArray = np.ascontiguousarray(
             image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8
         )
         if self.previous is not None:
-            kept, self.points = move_points(self.previous, grey, self.points, self.config)
+            kept, self.points = move_points(self.previous, gray, self.points, self.config)
             self.track = self.track[kept]
         if self.previous is None or self.since_query >= self.config.query_interval:
-            self._start((grey.shape[0], grey.shape[1]))
+            self._start((gray.shape[0], gray.shape[1]))
             self.since_query = 0
         self.since_query += 1
-        self.previous = grey
+        self.previous = gray
         return FrameTracks(self.track.copy(), self.points.astype(np.float64))
 
     def _start(self, image_size: tuple[int, int]) -> None:

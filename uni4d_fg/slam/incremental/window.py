@@ -111,7 +111,7 @@ class CameraWindow:
 
     config: Config
     prior_intrinsics: FloatArray
-    """(4,) centre of the intrinsics' prior."""
+    """(4,) center of the intrinsics' prior."""
     intrinsics: FloatArray
     noise: StaticNoise
     frame: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -360,7 +360,7 @@ class CameraWindow:
         in_oldest[used.track[used.frame == 0]] = True
         in_newest[used.track[used.frame == len(self) - 1]] = True
         window = self.config.incremental.window
-        # Knuth's multiplicative hash: neighbouring tracks of a grid get unrelated phases.
+        # Knuth's multiplicative hash: neighboring tracks of a grid get unrelated phases.
         phase = (self.landmark_track * 2654435761 >> 7) % window
         its_turn = (self.slides % window == phase) & (per_landmark >= window // 2)
         return in_oldest & (~in_newest | its_turn)

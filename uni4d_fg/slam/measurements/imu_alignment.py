@@ -45,7 +45,7 @@ class VisualInertialAlignment:
     """What aligns a visual reconstruction with inertial measurements."""
 
     scale: float
-    """Metres per unit of the visual reconstruction."""
+    """Meters per unit of the visual reconstruction."""
     scale_sigma: float
     """Its relative standard deviation."""
     gravity: FloatArray

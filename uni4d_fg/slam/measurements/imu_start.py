@@ -1,4 +1,4 @@
-"""Where bundle adjustment with an IMU starts: a visual bundle adjustment, brought to metres and joined by the IMU."""
+"""Where bundle adjustment with an IMU starts: a visual bundle adjustment, brought to meters and joined by the IMU."""
 
 from __future__ import annotations
 

@@ -222,10 +222,10 @@ def adjust_bundle(
     if config.structure == "relift":
         state = relift_structure(state, observations)
     keep = spatial_inliers(state[LANDMARK], config)
-    dropped["landmark far from its neighbours"] = int((~keep).sum())
+    dropped["landmark far from its neighbors"] = int((~keep).sum())
     if not keep.any():
         raise DegenerateProblemError(
-            f"bundle adjustment: all {len(keep)} landmarks are dropped as far from their neighbours; "
+            f"bundle adjustment: all {len(keep)} landmarks are dropped as far from their neighbors; "
             "raise outlier_factor or outlier_quantile"
         )
     track = state.numbers(LANDMARK)[:, 0]

@@ -1,4 +1,4 @@
-"""Stage 1: camera initialisation by depth reprojection over a sliding window.
+"""Stage 1: camera initialization by depth reprojection over a sliding window.
 
 Frames enter one by one. Each window holds the newest ``window`` frames; its poses (and, if free, the focal
 lengths) are solved against the depth reprojection of every ordered pair of its frames. Once the window has
@@ -198,7 +198,7 @@ def initialize_cameras(
     if num_frames > 1 and not summaries:
         counts = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in labelled.counts().items())
         raise DegenerateProblemError(
-            f"camera initialisation: no two frames share {config.min_tracks_per_frame} static tracks with depth "
+            f"camera initialization: no two frames share {config.min_tracks_per_frame} static tracks with depth "
             f"({counts}; {int(pairs.liftable.sum())} static observations have depth). Check masks (is everything "
             "marked as moving?), depth (is it zero or missing?) and tracks; 'uni4d-fg validate' lists what was found."
         )

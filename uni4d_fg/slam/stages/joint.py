@@ -29,7 +29,7 @@ from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, refine_structure
 from uni4d_fg.slam.stages.energy import Energy, energy_of, kernel_of
-from uni4d_fg.slam.stages.neighbours import nearest_neighbours
+from uni4d_fg.slam.stages.neighbors import nearest_neighbors
 from uni4d_fg.slam.stages.nonrigid import PointMesh, motion_terms
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise, StaticScene
@@ -52,8 +52,8 @@ def mesh_of(motion: DynamicScene, config: Config) -> PointMesh:
     row = np.full(exists.shape, -1)
     row[exists] = np.arange(int(exists.sum()))
     stage = config.nonrigid
-    pairs = nearest_neighbours(
-        motion.points, motion.observed, motion.instance, stage.neighbours, stage.max_neighbour_ratio
+    pairs = nearest_neighbors(
+        motion.points, motion.observed, motion.instance, stage.neighbors, stage.max_neighbor_ratio
     )
     return PointMesh(motion.track, motion.instance, row, motion.observed, pairs)
 

@@ -3,7 +3,7 @@ r"""The depth cue's scale where a moving object is, from the static scene around
 A cue errs by a frame-wide scale and, more weakly, by a field that is smooth over the image. The static
 landmarks measure both: s_i = log z_i - log D(uv_i). At a dynamic observation the scale is predicted by the
 median of the nearest static s_i in the image. Whether that is better than the frame's scale alone is not
-assumed but measured, by predicting static s_i from their neighbours without themselves.
+assumed but measured, by predicting static s_i from their neighbors without themselves.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LocalScale:
 
     @property
     def is_local(self) -> bool:
-        """Whether the neighbourhood predicts better than the frame's scale."""
+        """Whether the neighborhood predicts better than the frame's scale."""
         return self.sigma < self.frame_sigma
 
 
@@ -40,7 +40,7 @@ def predict_log_scale(
     static_log_scale: FloatArray,
     frame_log_scale: FloatArray,
     queries: Observations,
-    neighbours: int,
+    neighbors: int,
     samples: int,
 ) -> LocalScale:
     """Predict the cue's log-scale at observations of moving points.
@@ -50,26 +50,26 @@ def predict_log_scale(
         static_log_scale: (S,) log z - log cue of each; NaN where unknown.
         frame_log_scale: (T,) the frames' scales.
         queries: N observations to predict for.
-        neighbours: Static observations per prediction; 0 takes the frame's scale.
+        neighbors: Static observations per prediction; 0 takes the frame's scale.
         samples: Static observations per frame on which the prediction is measured, at most.
     """
     deviation = static_log_scale - frame_log_scale[static.frame]
     frame_sigma = robust_sigma(deviation[np.isfinite(deviation)])
     whole_frame = LocalScale(frame_log_scale[queries.frame], frame_sigma, frame_sigma)
-    if neighbours == 0:
+    if neighbors == 0:
         return whole_frame
     predicted, errors = np.zeros(len(queries)), [np.zeros(0)]
     for frame in range(len(frame_log_scale)):
         known = np.flatnonzero((static.frame == frame) & np.isfinite(deviation))
         mine = np.flatnonzero(queries.frame == frame)
-        if len(known) <= neighbours:
+        if len(known) <= neighbors:
             continue
         tree, values = cKDTree(static.uv[known]), deviation[known]
         sample = evenly_spread(len(known), samples)
-        _, near = tree.query(static.uv[known[sample]], k=neighbours + 1)
+        _, near = tree.query(static.uv[known[sample]], k=neighbors + 1)
         errors.append(values[sample] - np.median(values[near[:, 1:]], axis=1))
         if len(mine):
-            _, near = tree.query(queries.uv[mine], k=neighbours)
+            _, near = tree.query(queries.uv[mine], k=neighbors)
             predicted[mine] = np.median(values[near.reshape(len(mine), -1)], axis=1)
     sigma = robust_sigma(np.concatenate(errors))
     if not sigma < frame_sigma:

@@ -2,7 +2,7 @@
 
 Points start at the lift of the depth cue corrected by its frame's scale; frames in which a track is hidden
 between two observations are bridged linearly. As-rigid-as-possible links each track to its nearest
-neighbours of the same instance; temporal smoothness links a track to itself.
+neighbors of the same instance; temporal smoothness links a track to itself.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Round, Stage, StageRunner, run_stage
 from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
 from uni4d_fg.slam.stages.lifting import lift
-from uni4d_fg.slam.stages.neighbours import nearest_neighbours
+from uni4d_fg.slam.stages.neighbors import nearest_neighbors
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise
 
@@ -44,7 +44,7 @@ class PointMesh:
     observed: BoolArray
     """(M, T)."""
     pairs: IntArray
-    """(L, 2) neighbouring trajectories, each pair once."""
+    """(L, 2) neighboring trajectories, each pair once."""
 
     @property
     def num_points(self) -> int:
@@ -170,7 +170,7 @@ def build_mesh(
     config: NonRigidConfig,
     dropped: dict[str, int],
 ) -> tuple[PointMesh, Observations, IntArray, State]:
-    """Choose trajectories, lift their points and link neighbours.
+    """Choose trajectories, lift their points and link neighbors.
 
     Returns:
         The mesh, the observations of its tracks, the row of each observation, and the starting state.
@@ -198,7 +198,7 @@ def build_mesh(
     points[trajectory, observations.frame] = lifted
     _interpolate(points, exists)
     instance = instance_of_track[tracks]
-    pairs = nearest_neighbours(points, observed, instance, config.neighbours, config.max_neighbour_ratio)
+    pairs = nearest_neighbors(points, observed, instance, config.neighbors, config.max_neighbor_ratio)
     trajectory_of, frame_of = np.nonzero(exists)
     track_frame = np.stack([tracks[trajectory_of], frame_of], axis=1)
     state = State({DYNAMIC_POINT: points[exists]}, {DYNAMIC_POINT: track_frame})
@@ -262,7 +262,7 @@ def energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) 
     """Return which trajectories move plausibly.
 
     A trajectory's score is the largest over its frames of its own smoothness residual plus the mean change
-    of the distances to its neighbours, both in sigmas; scores above the quantile plus margin are dropped.
+    of the distances to its neighbors, both in sigmas; scores above the quantile plus margin are dropped.
     """
     step = np.linalg.norm(np.diff(points, n=config.smoothness_order, axis=1), axis=2)
     if step.shape[1] == 0:
@@ -284,8 +284,8 @@ def energy_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) 
 def spatial_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig) -> BoolArray:
     """Return which trajectories are near others of their instance.
 
-    A trajectory's score is the median over its observed frames of the distance to its nearest neighbour; one
-    above ``max_neighbour_ratio`` times the instance's median score floats in space (a wrong depth, mostly).
+    A trajectory's score is the median over its observed frames of the distance to its nearest neighbor; one
+    above ``max_neighbor_ratio`` times the instance's median score floats in space (a wrong depth, mostly).
     """
     seen = mesh.observed & np.isfinite(points).all(axis=2)
     nearest = np.full(seen.shape, np.nan)
@@ -301,5 +301,5 @@ def spatial_inliers(points: FloatArray, mesh: PointMesh, config: NonRigidConfig)
     for label in np.unique(mesh.instance[rated]).tolist():
         mine = mesh.instance[rated] == label
         typical = max(float(np.median(score[mine])), config.arap_sigma_m)  # coinciding tracks have none
-        keep[rated[mine]] = score[mine] <= config.max_neighbour_ratio * typical
+        keep[rated[mine]] = score[mine] <= config.max_neighbor_ratio * typical
     return keep

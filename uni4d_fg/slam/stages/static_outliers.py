@@ -82,7 +82,7 @@ def measure_noise(
 
 
 def spatial_inliers(landmarks: FloatArray, config: BundleAdjustmentConfig) -> BoolArray:
-    """Return which landmarks are not isolated: mean squared distance to 5 neighbours below the quantile rule."""
+    """Return which landmarks are not isolated: mean squared distance to 5 neighbors below the quantile rule."""
     if len(landmarks) < 7:
         return np.ones(len(landmarks), dtype=bool)
     from scipy.spatial import cKDTree

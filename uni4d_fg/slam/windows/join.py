@@ -5,10 +5,10 @@ With its landmarks eliminated a window says, about its own linearization point,
     E_w(d) = 1/2 d^T H d + g^T d,     d_i = Log(P_i^{-1} (T_0^{-1} T_i)),   d_s = s - s_0,   d_K = K - K_0,
 
 where T_0 is the pose of its first frame: only poses relative to it, log-scales and intrinsics, so that a window
-knows nothing of where the others put the world. The sum over windows is minimised by Gauss-Newton over all poses
+knows nothing of where the others put the world. The sum over windows is minimized by Gauss-Newton over all poses
 (frame 0 held) and log-scales; the intrinsics are held, as short windows tell them worse than frames far apart do, and
 count as uncertain as these say in the covariances. The matrix has one block per window and a border for the
-intrinsics, and is factorised as a sparse one.
+intrinsics, and is factorized as a sparse one.
 Source: Ni, Steedly and Dellaert 2007, "Tectonic SAM: exact, out-of-core, submap-based SLAM".
 """
 
@@ -117,7 +117,7 @@ def join(
     covariance: bool,
     added: AddedTerms | None = None,
 ) -> Joined:
-    """Minimise the windows' energies, and those of added factors, together.
+    """Minimize the windows' energies, and those of added factors, together.
 
     Args:
         information: Of every window.
@@ -148,7 +148,7 @@ def join(
             slope, more = added.linearize(cameras)
             gradient += slope
             entries += more
-        solver = _factorise(entries, size, at)
+        solver = _factorize(entries, size, at)
         step = np.zeros(size)
         step[at] = -solver.solve(gradient[at])
         if not np.isfinite(step).all():
@@ -179,7 +179,7 @@ def _entries(part: WindowInformation, block: FloatArray, num_frames: int) -> Ent
     return np.repeat(place, len(place)), np.tile(place, len(place)), block.reshape(-1)
 
 
-def _factorise(entries: list[Entries], size: int, at: IntArray) -> scipy.sparse.linalg.SuperLU:
+def _factorize(entries: list[Entries], size: int, at: IntArray) -> scipy.sparse.linalg.SuperLU:
     rows, columns, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     matrix = scipy.sparse.csc_matrix((values, (rows, columns)), shape=(size, size))[at][:, at].tocsc()
     try:
@@ -213,7 +213,7 @@ def _covariances(
     entries = [_entries(part, block, num_frames) for part, block in zip(information, curvatures, strict=True)]
     if added is not None:
         entries += added.linearize(cameras)[1]
-    solver = _factorise(entries, size, at)
+    solver = _factorize(entries, size, at)
     poses, intrinsics = np.zeros((num_frames, 6, 6)), np.zeros((4, 4))
 
     def add(sides: FloatArray, factor: float = 1.0) -> None:

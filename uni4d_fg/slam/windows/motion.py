@@ -22,7 +22,7 @@ def join_motion(windows: list[Window], weights: list[FloatArray], parts: list[Ar
 
     Args:
         windows: Frames of each window.
-        weights: (N,) weight of each window's frames; those of neighbours add up to one.
+        weights: (N,) weight of each window's frames; those of neighbors add up to one.
         parts: Per window: points (m, N, 3), NaN where there is none; observed (m, N); track (m,) numbers in the whole
             video; instance (m,).
 

@@ -32,7 +32,7 @@ class Window:
 
 
 def plan_windows(num_frames: int, frames: int, overlap: int) -> list[Window]:
-    """Return windows of equal length, at most ``frames``, of which neighbours share ``overlap`` frames.
+    """Return windows of equal length, at most ``frames``, of which neighbors share ``overlap`` frames.
 
     No frame is in more than two windows.
 
@@ -141,7 +141,7 @@ def owned_range(
 def _change(first: IntArray, last: IntArray, track: IntArray, earlier: Window, later: Window) -> IntArray:
     """Return the first frame (n,) that the later window owns."""
     width = earlier.stop - later.start
-    # Knuth's multiplicative hash: neighbouring tracks of a grid change hands at unrelated frames.
+    # Knuth's multiplicative hash: neighboring tracks of a grid change hands at unrelated frames.
     spread = later.start + 1 + (track.astype(np.int64) * 2654435761 >> 7) % max(width - 1, 1)
     result: IntArray = np.where(last < earlier.stop, earlier.stop, np.where(first >= later.start, later.start, spread))
     return result
@@ -157,7 +157,7 @@ def middle_frames(windows: list[Window], index: int) -> BoolArray:
 
 
 def blend_weight(windows: list[Window], index: int) -> FloatArray:
-    """Return the weight (N,) of a window's frames in the joined result; neighbours' weights add up to one."""
+    """Return the weight (N,) of a window's frames in the joined result; neighbors' weights add up to one."""
     window, weight = windows[index], np.ones(len(windows[index]))
     if index > 0:
         width = windows[index - 1].stop - window.start

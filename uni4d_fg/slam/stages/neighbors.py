@@ -1,4 +1,4 @@
-"""Which dynamic tracks are neighbours: the links of as-rigid-as-possible."""
+"""Which dynamic tracks are neighbors: the links of as-rigid-as-possible."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from scipy.spatial import cKDTree
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 
 
-def nearest_neighbours(
+def nearest_neighbors(
     points: FloatArray, observed: BoolArray, instance: IntArray, count: int, max_ratio: float
 ) -> IntArray:
-    """Link every trajectory to its nearest neighbours of the same instance.
+    """Link every trajectory to its nearest neighbors of the same instance.
 
-    Neighbours are searched in the frame in which most of the instance's trajectories are seen together with
+    Neighbors are searched in the frame in which most of the instance's trajectories are seen together with
     the trajectory itself: of the frames that see it, the one with the largest number of seen trajectories.
 
     Args:
         points: (M, T, 3) starting points, world; NaN where there is none.
         observed: (M, T).
         instance: (M,) mask ids; only trajectories of one instance are linked.
-        count: Neighbours per trajectory.
+        count: Neighbors per trajectory.
         max_ratio: Links longer than this many times the instance's median link are dropped.
 
     Returns:
