@@ -62,7 +62,10 @@ TrackModel = Annotated[
     str | None, typer.Option(metavar="CARD[=ONNX]", help="Make tracks with a network.", show_default=False)
 ]
 IntrinsicsFile = Annotated[
-    str | None, typer.Option("--intrinsics", help="Calibration: .npy of a (3, 3) matrix, px.", show_default=False)
+    str | None,
+    typer.Option(
+        "--intrinsics", help="Calibration: .npy, COLMAP, OpenCV, ROS, Kalibr, nerfstudio.", show_default=False
+    ),
 ]
 Imu = Annotated[
     Path | None,

@@ -23,6 +23,10 @@ class SyntheticSceneConfig(Section):
     height: int = setting(240, "Image height, px.", ge=16)
     width: int = setting(320, "Image width, px.", ge=16)
     focal: float = setting(300.0, "True focal length of both axes, px.", gt=0)
+    camera_model: Literal["PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = setting(
+        "PINHOLE", "Camera model, by COLMAP's names."
+    )
+    distortion: tuple[float, ...] = setting((), "Distortion parameters of the camera model.")
     frame_rate: float = setting(15.0, "Frames per second: a higher rate means less motion per frame, Hz.", gt=0)
     path: PathKind = setting("handheld", "Camera trajectory: 'handheld', 'static', 'rotation' or 'forward'.")
     camera_speed: float = setting(0.42, "Speed of the camera along its path, m/s.", ge=0, le=10)

@@ -10,7 +10,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.card import CardKind, find_model
 from uni4d_fg.cues.session import weights_hash
 from uni4d_fg.frontend.sequence.assemble import check_count, open_depth
-from uni4d_fg.frontend.sequence.calibration import load_intrinsics
+from uni4d_fg.frontend.sequence.calibration_files import load_calibration
 from uni4d_fg.frontend.sequence.model import Video
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.track_files import load_track_file
@@ -33,7 +33,7 @@ class CueFiles:
     tracks: Path | None = None
     """``.npz`` file of tracks in any of the known forms."""
     intrinsics: Path | None = None
-    """``.npy`` file of one (3, 3) matrix, or one per frame."""
+    """Calibration in any form that :mod:`uni4d_fg.frontend.sequence.calibration_files` knows."""
     classes: tuple[str, ...] | None = None
     """Of ``masks``: names of the classes that may move."""
 
@@ -60,7 +60,8 @@ class CueFiles:
         if self.tracks is not None:
             changes["tracks"] = load_track_file(self.tracks, count).to_tracks(count, size)
         if self.intrinsics is not None:
-            changes["intrinsics"] = load_intrinsics(self.intrinsics, count, size)
+            calibration = load_calibration(self.intrinsics, count, size)
+            changes |= {"intrinsics": calibration.intrinsics, "lens": calibration.lens}
         return replace(video, **changes)
 
     def __bool__(self) -> bool:

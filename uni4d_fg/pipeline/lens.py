@@ -51,8 +51,11 @@ class CameraModel:
 def is_sought(sequence: Sequence, config: Config) -> bool:
     """Return whether the lens is estimated.
 
-    That needs the likelihood of energy 'map', Levenberg-Marquardt, and poses and intrinsics that may move.
+    That needs the likelihood of energy 'map', Levenberg-Marquardt, and poses and intrinsics that may move. A lens that
+    came with the sequence is taken as it is, unless a model is asked for.
     """
+    if config.camera.model == "auto" and not sequence.lens.is_pinhole:
+        return False
     if config.camera.model == "pinhole" or config.input.intrinsics == "fixed" or config.input.poses != "estimate":
         return False
     return config.energy == "map" and config.solver == "lm" and config.bundle_adjustment.depth_prior

@@ -125,7 +125,7 @@ def _stream(
     should_stop: Callable[[], bool] | None, sources: tuple[FactorSource, ...],
 ) -> StreamSummary:  # fmt: skip
     folder, key = StreamFolder(run_dir), StreamKey(sequence, config, sources)
-    solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder, sources)
+    solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder, sources, sequence.lens)
     # What is there is touched only when it is known that this goes on from it, or replaces it.
     resumed = folder.resume(solver, key, should_stop) if resume else False
     remove_leftovers(RunFolder(run_dir))

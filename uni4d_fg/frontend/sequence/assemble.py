@@ -169,6 +169,7 @@ def as_sequence(video: Video) -> Sequence:
         frame_names=video.frame_names,
         initial_world_T_cam=video.initial_world_T_cam,
         tracks=video.tracks,
+        lens=video.lens,
         ground_truth=video.ground_truth,
     )
 

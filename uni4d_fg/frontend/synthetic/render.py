@@ -11,6 +11,7 @@ from uni4d_fg.frontend.synthetic.raycast import Hits, RayCaster, interpolate, tr
 from uni4d_fg.frontend.synthetic.scene import Scene
 from uni4d_fg.frontend.synthetic.texture import reflectance
 from uni4d_fg.geometry.camera import unproject
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 
 _LIGHT = np.array([-0.35, -0.75, -0.56])  # unit vector from the surface to the light
 _AMBIENT = 0.7
@@ -35,7 +36,9 @@ def pixel_grid(height: int, width: int) -> FloatArray:
     return np.stack((u.ravel(), v.ravel()), axis=-1).astype(np.float64)
 
 
-def cast_pixels(caster: RayCaster, world_T_cam: FloatArray, intrinsics: FloatArray, uv: FloatArray) -> Hits:
+def cast_pixels(
+    caster: RayCaster, world_T_cam: FloatArray, intrinsics: FloatArray, uv: FloatArray, lens: Lens = PINHOLE
+) -> Hits:
     """Cast rays through pixels; the directions have unit z in the camera, so distances are z-depths.
 
     Args:
@@ -43,8 +46,10 @@ def cast_pixels(caster: RayCaster, world_T_cam: FloatArray, intrinsics: FloatArr
         world_T_cam: (4, 4) camera to world.
         intrinsics: (4,) fx, fy, cx, cy, px.
         uv: (N, 2) pixels.
+        lens: Distortion of the camera.
     """
-    direction = unproject(intrinsics, uv, np.ones(len(uv))) @ world_T_cam[:3, :3].T
+    ideal = lens.ideal_pixels(intrinsics, uv)
+    direction = unproject(intrinsics, ideal, np.ones(len(uv))) @ world_T_cam[:3, :3].T
     return caster.cast(world_T_cam[:3, 3], direction)
 
 
@@ -76,6 +81,7 @@ def render_frame(
     intrinsics: FloatArray,
     image_size: tuple[int, int],
     with_image: bool = True,
+    lens: Lens = PINHOLE,
 ) -> RenderedFrame:
     """Render one frame.
 
@@ -90,17 +96,18 @@ def render_frame(
         intrinsics: (4,) fx, fy, cx, cy, px.
         image_size: (height, width), px.
         with_image: Whether to shade color.
+        lens: Distortion of the camera.
     """
     height, width = image_size
     uv = pixel_grid(height, width)
-    hits = cast_pixels(caster, world_T_cam, intrinsics, uv)
+    hits = cast_pixels(caster, world_T_cam, intrinsics, uv, lens)
     depth = np.where(hits.valid, hits.distance, np.nan).astype(np.float32).reshape(height, width)
     instance = np.where(hits.valid, scene.triangle_instance[hits.triangle], 0).astype(np.int32)
     image = None
     if with_image:
         total = np.zeros((len(uv), 3))
         for offset in _SUPERSAMPLES:
-            sample = cast_pixels(caster, world_T_cam, intrinsics, uv + np.asarray(offset))
+            sample = cast_pixels(caster, world_T_cam, intrinsics, uv + np.asarray(offset), lens)
             total += _shade(scene, vertices, world_T_cam[:3, 3], sample)
         mean = total / len(_SUPERSAMPLES)
         image = np.round(255.0 * mean).astype(np.uint8).reshape(height, width, 3)

@@ -15,6 +15,7 @@ from uni4d_fg.frontend.synthetic.raycast import RayCaster
 from uni4d_fg.frontend.synthetic.render import render_frame
 from uni4d_fg.frontend.synthetic.scene import make_scene
 from uni4d_fg.frontend.synthetic.tracks import ExactTracks, SurfacePoints, TrackFollower, pick_points, query_grid
+from uni4d_fg.geometry.lens import Lens
 
 _FLAT_GRAY = np.uint8(128)
 
@@ -43,6 +44,7 @@ def simulate(config: SyntheticSceneConfig) -> Simulation:
     intrinsics = np.array(
         [config.focal, config.focal, 0.5 * (config.width - 1), 0.5 * (config.height - 1)], dtype=np.float64
     )
+    lens = Lens(config.camera_model, config.distortion)
     timestamps = np.arange(config.num_frames) / config.frame_rate
     world_T_cam = camera_path(config.path, timestamps, config.camera_speed)
     scene = make_scene(config.objects, config.objects_per_kind)
@@ -59,12 +61,14 @@ def simulate(config: SyntheticSceneConfig) -> Simulation:
         vertices = scene.vertices(timestamps[t])
         caster = RayCaster(vertices, scene.triangles)
         casters.append(caster)
-        frame = render_frame(scene, vertices, caster, world_T_cam[t], intrinsics, image_size, config.render_images)
+        frame = render_frame(
+            scene, vertices, caster, world_T_cam[t], intrinsics, image_size, config.render_images, lens
+        )
         depths[t], masks[t] = frame.depth, frame.instance
         if frame.image is not None:
             images[t] = frame.image
         if t % config.query_interval == 0:
-            picked.append(pick_points(caster, world_T_cam[t], intrinsics, grid, t))
+            picked.append(pick_points(caster, world_T_cam[t], intrinsics, grid, t, lens))
 
     follower = TrackFollower(
         SurfacePoints.concatenate(picked),
@@ -73,6 +77,7 @@ def simulate(config: SyntheticSceneConfig) -> Simulation:
         world_T_cam,
         intrinsics,
         image_size,
+        lens,
     )
     for t, caster in enumerate(casters):
         follower.add_frame(t, scene.vertices(timestamps[t]), caster)

@@ -10,6 +10,7 @@ from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from uni4d_fg.frontend.synthetic.raycast import RayCaster, interpolate, triangle_normals
 from uni4d_fg.frontend.synthetic.render import cast_pixels
 from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 
 _OCCLUSION_TOLERANCE = 1e-3
 _MIN_DEPTH_M = 0.05
@@ -67,18 +68,20 @@ def query_grid(image_size: tuple[int, int], columns: int, rows: int, margin_px: 
 
 
 def pick_points(
-    caster: RayCaster, world_T_cam: FloatArray, intrinsics: FloatArray, uv: FloatArray, frame: int
-) -> SurfacePoints:
+    caster: RayCaster, world_T_cam: FloatArray, intrinsics: FloatArray, uv: FloatArray, frame: int,
+    lens: Lens = PINHOLE,
+) -> SurfacePoints:  # fmt: skip
     """Pick the surface points seen at pixels ``uv`` (N, 2) of one frame; pixels that see nothing are left out."""
-    hits = cast_pixels(caster, world_T_cam, intrinsics, uv)
+    hits = cast_pixels(caster, world_T_cam, intrinsics, uv, lens)
     keep = hits.valid
     query_frame = np.full(int(keep.sum()), frame, dtype=np.int32)
     return SurfacePoints(hits.triangle[keep], hits.barycentric[keep], query_frame)
 
 
 def project_points(
-    points: FloatArray, world_T_cam: FloatArray, intrinsics: FloatArray, image_size: tuple[int, int]
-) -> tuple[FloatArray, BoolArray]:
+    points: FloatArray, world_T_cam: FloatArray, intrinsics: FloatArray, image_size: tuple[int, int],
+    lens: Lens = PINHOLE,
+) -> tuple[FloatArray, BoolArray]:  # fmt: skip
     """Project world points into one frame.
 
     Returns:
@@ -87,8 +90,13 @@ def project_points(
     """
     height, width = image_size
     point_cam = world_to_camera(world_T_cam, points)
-    uv = np.asarray(project(intrinsics, point_cam))
-    uv = np.where(point_cam[:, 2:] > _MIN_DEPTH_M, uv, np.nan)
+    ideal = np.asarray(project(intrinsics, point_cam))
+    uv = lens.real_pixels(intrinsics, np.where(point_cam[:, 2:] > _MIN_DEPTH_M, ideal, np.nan))
+    if not lens.is_pinhole:
+        # Beyond the fold of a lens, directions far outside of the image would come to lie in it.
+        back = lens.ideal_pixels(intrinsics, uv)
+        with np.errstate(invalid="ignore"):
+            uv = np.where(np.abs(back - ideal).max(axis=1, keepdims=True) < 1e-3, uv, np.nan)
     inside = (uv >= 0).all(axis=-1) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
     return uv, inside
 
@@ -113,6 +121,7 @@ class TrackFollower:
         world_T_cam: (T, 4, 4) camera to world.
         intrinsics: (4,) fx, fy, cx, cy, px.
         image_size: (height, width), px.
+        lens: Distortion of the camera.
     """
 
     def __init__(
@@ -123,9 +132,11 @@ class TrackFollower:
         world_T_cam: FloatArray,
         intrinsics: FloatArray,
         image_size: tuple[int, int],
+        lens: Lens = PINHOLE,
     ) -> None:
         self._surface, self._triangles = surface, triangles
         self._world_T_cam, self._intrinsics, self._image_size = world_T_cam, intrinsics, image_size
+        self._lens = lens
         k, t = len(surface.triangle), len(world_T_cam)
         self._instance = triangle_instance[surface.triangle]
         self._points = np.empty((k, t, 3))
@@ -137,7 +148,7 @@ class TrackFollower:
         """Follow the points into ``frame``, where the mesh has ``vertices`` (V, 3) and ``caster``."""
         pose = self._world_T_cam[frame]
         points = self._surface.positions(vertices, self._triangles)
-        uv, inside = project_points(points, pose, self._intrinsics, self._image_size)
+        uv, inside = project_points(points, pose, self._intrinsics, self._image_size, self._lens)
         normal = triangle_normals(vertices, self._triangles)[self._surface.triangle]
         self._points[:, frame] = points
         self._uv[:, frame] = uv

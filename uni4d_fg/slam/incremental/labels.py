@@ -15,7 +15,9 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int
 from uni4d_fg.config.cues import InputConfig, LabelConfig
 from uni4d_fg.frontend.tracks.depth_sampling import sample_depth
 from uni4d_fg.frontend.tracks.mask_certainty import UNCERTAIN, certain_labels
+from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.slam.incremental.model import FrameTracks
+from uni4d_fg.slam.lens.tracks import ideal_weight
 
 UNKNOWN, REJECTED = -1, -2
 
@@ -38,6 +40,15 @@ class LabelledFrame:
     """(n,) 0 static, > 0 instance."""
     rejected: IntArray
     """Tracks that turned out to be unreliable in this frame."""
+
+    def ideal(self, lens: Lens, intrinsics: FloatArray) -> LabelledFrame:
+        """Return the observations on the ideal pixels of a lens; see :func:`uni4d_fg.slam.lens.tracks.ideal_tracks`."""
+        if lens.is_pinhole:
+            return self
+        uv = lens.ideal_pixels(intrinsics, self.uv)
+        seen = np.isfinite(uv).all(axis=1)
+        weight = self.weight[seen] * ideal_weight(lens, intrinsics, uv[seen])
+        return LabelledFrame(self.track[seen], uv[seen], self.depth[seen], weight, self.label[seen], self.rejected)
 
     def select(self, static: bool) -> LabelledFrame:
         """Return the static or the moving observations."""

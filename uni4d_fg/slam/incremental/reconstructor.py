@@ -13,6 +13,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.optim.backend import choose_backend
 from uni4d_fg.optim.stage import LevenbergMarquardtRunner
@@ -65,6 +66,7 @@ class IncrementalReconstructor:
         results: Takes what leaves the window; kept in memory when None.
         additions: Factors and variables of your own, asked for before every solve of the window; keys count frames from
             the first, see :mod:`uni4d_fg.optim.added_factors`. Frames that are no keyframes are in no solve.
+        lens: Distortion of the images; it goes with the intrinsics, which are held where there is any.
 
     Raises:
         ConfigError: If the configuration asks for what cannot be done in a window.
@@ -78,6 +80,7 @@ class IncrementalReconstructor:
         config: Config,
         results: Results | None = None,
         additions: Iterable[FactorSource] = (),
+        lens: Lens = PINHOLE,
     ):
         if config.energy != "map" or config.solver != "lm":
             raise ConfigError("incremental solving is made for energy 'map' and solver 'lm'; the paper's norms have no "
@@ -91,7 +94,10 @@ class IncrementalReconstructor:
         intrinsics = np.array(intrinsics, dtype=np.float64)
         if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
             raise InputError(f"intrinsics must be fx, fy, cx, cy in px with positive focal lengths, got {intrinsics}")
-        self.config, self.image_size = config, checked_size(image_size)
+        if not lens.is_pinhole:
+            held = config.input.model_copy(update={"intrinsics": "fixed"})
+            config = config.model_copy(update={"input": held})
+        self.config, self.lens, self.image_size = config, lens, checked_size(image_size)
         ba = config.bundle_adjustment
         noise = StaticNoise(ba.reprojection_sigma_px, ba.depth_sigma, ba.depth_correlation)
         self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise, sources=tuple(additions))
@@ -154,7 +160,7 @@ class IncrementalReconstructor:
             found = self.book.observe(
                 frame, tracks, image, depth, mask, self.config.labels, self.config.input,
                 self.config.bundle_adjustment.drift_frames,
-            )  # fmt: skip
+            ).ideal(self.lens, self.window.prior_intrinsics)  # fmt: skip
         self.window.remove_tracks(found.rejected)
         self.dynamic.remove_tracks(found.rejected)
         static, moving = found.select(static=True), found.select(static=False)
@@ -194,7 +200,7 @@ class IncrementalReconstructor:
         """
         self.flush()
         return assemble_results(
-            self.results, self.window.intrinsics, self.window.intrinsics_covariance, self.image_size
+            self.results, self.window.intrinsics, self.window.intrinsics_covariance, self.image_size, self.lens
         )
 
     def flush(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import DegenerateProblemError
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.slam.incremental.model import FinishedFrame, Landmarks
 from uni4d_fg.slam.reconstruction import Reconstruction
 
@@ -52,8 +53,9 @@ class ResultsInMemory:
 
 
 def assemble_results(
-    results: Results, intrinsics: FloatArray, intrinsics_covariance: FloatArray, image_size: tuple[int, int]
-) -> Reconstruction:
+    results: Results, intrinsics: FloatArray, intrinsics_covariance: FloatArray, image_size: tuple[int, int],
+    lens: Lens = PINHOLE,
+) -> Reconstruction:  # fmt: skip
     """Collect a :class:`Reconstruction`; a track whose landmark was started anew counts once, as the weighted mean.
 
     Trajectories take memory for every frame of the video: 25 bytes per moving track and frame.
@@ -76,6 +78,7 @@ def assemble_results(
         points[row, t], observed[row, t] = here.point, here.observed
         instance[row], colors[row] = here.instance, here.color
     return Reconstruction(
+        lens=lens,
         world_T_cam=np.stack([frame.world_T_cam for frame in frames]),
         intrinsics=intrinsics,
         timestamps=np.array([frame.timestamp for frame in frames]),
