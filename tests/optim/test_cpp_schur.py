@@ -401,9 +401,8 @@ def test_what_is_taken(rng: np.random.Generator) -> None:
     for refused in (held, several, in_part, on_two):
         with pytest.raises(SolverError, match=re.escape(f"does not take this problem: {refusal(refused)}")):
             CppSchurObjective(refused, state, CONFIG)
-    for missing in (POSE, INTRINSICS):
-        left = State({v: array for v, array in state.arrays.items() if v is not missing}, state.index)
-        assert refusal(problem, left) == "the C++ landmark solver needs poses and intrinsics"
+    left = State({v: array for v, array in state.arrays.items() if v is not POSE}, state.index)
+    assert refusal(problem, left) == "the C++ landmark solver needs poses"
     more = state.replace({LOG_SCALE: np.zeros((7, 1))})
     assert refusal(problem, state) == ""
     assert refusal(problem, more) == "the C++ landmark solver needs one log-scale per frame"
@@ -441,7 +440,7 @@ def test_without_poses_the_fallback_solves(rng: np.random.Generator) -> None:
     config = SolverConfig(relative_decrease=1e-13, max_iterations=300)
     planned = make_objective(Backend("cpp"), problem, state, config)
     assert type(planned.objective) is SchurObjective
-    assert planned.why == "the C++ landmark solver needs poses and intrinsics"
+    assert planned.why == "the C++ landmark solver needs poses"
     solved, _ = minimize(planned.objective, state, config)
     # Of the residual's variance of 1 + 0.5^2 + 0.1^2 every part takes its share.
     pull = (1.0 - points[:, 1]) / (1.0 + 0.25 + 0.01)

@@ -30,7 +30,7 @@ from uni4d_fg.optim.summary import SolveSummary, Termination
 OPTIMIZERS = ("gtsam_levenberg_marquardt", "gtsam_dogleg")
 every_optimizer = pytest.mark.parametrize("optimizer", OPTIMIZERS)
 RUN = LevenbergMarquardtRunner(Backend("python"))
-MAP = pose_variable("test_optimizer_map", "M", ("map",))
+MAP = pose_variable("test_optimizer_map", "T", ("map",))
 K = np.array([500.0, 505.0, 320.0, 240.0])
 
 

@@ -90,15 +90,16 @@ def test_every_writer_fails_cleanly_and_the_run_goes_on_where_it_was(
     check_run(tmp_path, sequence)
     assert_same_result(tmp_path, complete)
     stages = [
-        "tracks.npz", "camera_init.graph.npz", "camera_init.npz", "bundle_adjustment.graph.npz",
+        "tracks.npz", "lens.graph.npz", "lens.npz", "camera_init.graph.npz", "camera_init.npz",
+        "bundle_adjustment.graph.npz",
         "bundle_adjustment.npz", "nonrigid.graph.npz", "nonrigid.npz",
     ]  # fmt: skip
-    kinds = ("bundle_adjustment", "camera_init", "nonrigid")
+    kinds = ("bundle_adjustment", "camera_init", "lens", "nonrigid")
     values = [f"{kind}.{end}.values" for kind in kinds for end in ("initial", "final")]
     views = ["static.ply", *(f"{t:05d}.ply" for t in range(4))]
     assert failed == [
-        "config.yaml", "labels.npz", *stages, "depth.npy", "fusion.npz", "reconstruction.npz", "trajectory.tum",
-        *views, *values, "summary.json",
+        "run.json", "config.yaml", "labels.npz", *stages, "depth.npy", "fusion.npz", "reconstruction.npz",
+        "trajectory.tum", *views, *values, "summary.json",
     ]  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from uni4d_fg.pipeline import reconstruct
 
 pytest.importorskip("open3d")
 
-TASKS = ["tracks", "camera init", "bundle adjustment", "nonrigid", "fusion", "clouds and pictures"]
+TASKS = ["tracks", "lens", "camera init", "bundle adjustment", "nonrigid", "fusion", "clouds and pictures"]
 
 
 class Recorder:

@@ -64,7 +64,15 @@ def abs_rel(report: DepthReport | None, region: str) -> float:
 
 def test_the_run_is_complete(run: tuple[RunSummary, Reconstruction, EvaluationReport]) -> None:
     summary, result, _ = run
-    assert list(summary.stages) == ["tracks", "camera_init", "bundle_adjustment", "nonrigid", "fusion", "output"]
+    assert list(summary.stages) == [
+        "tracks",
+        "lens",
+        "camera_init",
+        "bundle_adjustment",
+        "nonrigid",
+        "fusion",
+        "output",
+    ]
     assert summary.stages["camera_init"]["bridged_frames"] == []
     assert len(result.landmarks) > 1000
     assert len(result.dynamic_points) > 20

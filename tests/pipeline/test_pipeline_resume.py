@@ -36,7 +36,7 @@ pytest.importorskip("open3d")
 QUICK = (
     "camera_init.window=3", "camera_init.solver.max_iterations=4", "nonrigid.solver.max_iterations=4",
     "bundle_adjustment.solver.max_iterations=4", "bundle_adjustment.measure_noise=false",
-    "bundle_adjustment.structure=keep",
+    "bundle_adjustment.structure=keep", "camera.model=pinhole",
 )  # fmt: skip
 STAGES = ("tracks", "camera_init", "bundle_adjustment", "nonrigid", "fusion")
 

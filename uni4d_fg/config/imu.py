@@ -11,10 +11,10 @@ class ImuConfig(Section):
     gravity: float = setting(9.81, "Acceleration of gravity at the place, m/s^2 (9.78 to 9.83).", gt=0, basic=True)
     gravity_sigma: float = setting(0.01, "Standard deviation of that, m/s^2.", gt=0)
     accelerometer_bias_sigma: float = setting(
-        0.1, "Standard deviation of each entry of the first accelerometer bias about zero, m/s^2.", gt=0, basic=True
+        0.1, "Standard deviation of each entry of the first accelerometer bias about zero, m/s^2.", gt=0
     )
     gyroscope_bias_sigma: float = setting(
-        0.01, "Standard deviation of each entry of the first gyroscope bias about zero, rad/s.", gt=0, basic=True
+        0.01, "Standard deviation of each entry of the first gyroscope bias about zero, rad/s.", gt=0
     )
     integration_sigma: float = setting(
         1e-4, "What integration in steps of the samples adds to the noise of positions, m/sqrt(s).", gt=0

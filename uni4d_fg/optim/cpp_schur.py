@@ -50,8 +50,8 @@ def refusal(problem: Problem, state: State | None = None) -> str:
         return "no landmarks are eliminated"
     if problem.is_free_in_part(LANDMARK):
         return "some entries of a landmark are frozen and others are not"
-    if state is not None and not (POSE in state and INTRINSICS in state):
-        return "the C++ landmark solver needs poses and intrinsics"
+    if state is not None and POSE not in state:
+        return "the C++ landmark solver needs poses"
     if state is not None and LOG_SCALE in state and len(state[LOG_SCALE]) != len(state[POSE]):
         return "the C++ landmark solver needs one log-scale per frame"
     if problem.is_free(INTRINSICS) and len(problem.free[INTRINSICS]) != 1:
@@ -171,7 +171,9 @@ class CppSchurObjective:
 
     def _arguments(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         scales = state[LOG_SCALE][:, 0] if LOG_SCALE in state.arrays else np.zeros(self.num_frames)
-        return _dense(state[POSE]), _dense(state[INTRINSICS][0]), _dense(scales), _dense(state[LANDMARK])
+        # Without a pinhole no factor of C++'s own projects: its numbers are not read.
+        intrinsics = state[INTRINSICS][0] if INTRINSICS in state.arrays else np.ones(4)
+        return _dense(state[POSE]), _dense(intrinsics), _dense(scales), _dense(state[LANDMARK])
 
 
 def _dense(array: Any) -> FloatArray:

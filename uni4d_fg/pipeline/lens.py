@@ -83,8 +83,8 @@ def lens_step(
         if config.camera.model != "auto":
             raise
         found = LensCalibration(PINHOLE, sequence.intrinsics, note=f"no distortion was sought: {error}")
-    if hooks.should_stop is not None and hooks.should_stop():
-        raise Cancelled(STOPPED)
+    except Cancelled as error:
+        raise Cancelled(STOPPED) from error
     arrays = {
         "model": np.array([list(PARAMETERS).index(found.lens.model)]),
         "parameters": found.lens.padded,

@@ -155,20 +155,20 @@ def reconstruct(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    recorder = RecordingRunner(stage_runner(config))
     with run_lock(run_dir):
         mark_run(run_dir)
         return _reconstruct(
-            sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False), cues or {},
-            additions, measurements or MeasurementFiles(), imu,
+            recorder, sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False),
+            cues or {}, additions, measurements or MeasurementFiles(), imu,
         )  # fmt: skip
 
 
 def _reconstruct(
-    sequence: Sequence, run_dir: Path, config: Config, resume: bool, reporter: Reporter,
+    recorder: RecordingRunner, sequence: Sequence, run_dir: Path, config: Config, resume: bool, reporter: Reporter,
     should_stop: Callable[[], bool], cues: dict[str, Any], additions: Iterable[FactorSource],
     measurements: MeasurementFiles, imu: ImuSamples | None,
 ) -> RunSummary:  # fmt: skip
-    recorder = RecordingRunner(stage_runner(config))
     measured = read_measurements(measurements, sequence.timestamps, config.measurements)
     sources = (*additions, *measured.sources)
     run_stage = with_additions(recorder, sources)
@@ -203,7 +203,8 @@ def _reconstruct(
     )
     key, camera = _camera(run, key, labelled)
     key, scene, motion = _stages(run, key, *camera.apply(sequence, labelled, config), windows, run_stage)
-    summary.stages["bundle_adjustment"]["facts"] = [*summary.stages["bundle_adjustment"]["facts"], *measured.facts]
+    adjusted = summary.stages["bundle_adjustment"]
+    adjusted["facts"] = [*adjusted.get("facts", []), *measured.facts]
     key = stage_key(key, config.fusion)
     _fuse(run, key, labelled, scene, motion)
     reconstruction = assemble(sequence, labelled, scene, motion, camera.lens)

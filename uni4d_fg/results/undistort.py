@@ -17,7 +17,7 @@ from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.results.run import Run
 
-_BORDER_SAMPLES = 64
+_BORDER_SAMPLES = 256
 _FOCAL_RANGE = (0.1, 4.0)
 """Focal lengths that are tried, in those of the camera."""
 

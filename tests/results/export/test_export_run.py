@@ -111,9 +111,16 @@ def test_an_empty_folder_is_filled(source: Run, tmp_path: Path) -> None:
 
 def test_overwriting_leaves_nothing_of_the_old(source: Run, tmp_path: Path) -> None:
     export_run(source, ["colmap"], tmp_path)
-    (tmp_path / "colmap" / "stale").write_text("old")
-    export_run(source, ["colmap"], tmp_path, overwrite=True)
-    assert "stale" not in names(tmp_path / "colmap")
+    export_run(source, ["colmap"], tmp_path, ExportOptions(text=False), overwrite=True)
+    assert "sparse_text" not in names(tmp_path / "colmap")
+
+
+def test_files_of_others_in_an_export_stay(source: Run, tmp_path: Path) -> None:
+    export_run(source, ["colmap"], tmp_path)
+    (tmp_path / "colmap" / "mine").write_text("mine")
+    with pytest.raises(OutputError, match="holds mine, which is not of the export"):
+        export_run(source, ["colmap"], tmp_path, overwrite=True)
+    assert (tmp_path / "colmap" / "mine").read_text() == "mine"
     assert names(tmp_path) == ["colmap"]
 
 

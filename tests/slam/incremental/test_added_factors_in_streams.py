@@ -221,7 +221,7 @@ def test_a_stream_with_measurements_goes_on_bit_by_bit(sequence: Sequence, odome
     assert any("odometry of 28 of 28 frames" in line for line in summary.lines())
     whole, cut = (load_reconstruction(tmp_path / name / "reconstruction.npz") for name in ("whole", "cut"))
     np.testing.assert_array_equal(whole.world_T_cam, cut.world_T_cam)
-    with pytest.raises(InputError, match="another configuration, sequence or measurements"):
+    with pytest.raises(InputError, match="another configuration, selection of frames, calibration or"):
         stream_sequence(sequence, tmp_path / "cut", config, resume=True)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
-from uni4d_fg.geometry.lens import Lens
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 
 CAMERA_MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 """COLMAP's numbers of the models with fx, fy, cx, cy, of which the last two have four parameters more."""
@@ -26,7 +26,6 @@ class ColmapModel:
     """(height, width), px."""
     intrinsics: FloatArray
     """(4,) fx, fy, cx, cy, px."""
-    lens: Lens
     names: list[str]
     """T file names."""
     quaternions: FloatArray
@@ -45,6 +44,7 @@ class ColmapModel:
     """(N,) row of the image of each observation."""
     uv: FloatArray
     """(N, 2) px."""
+    lens: Lens = PINHOLE
 
     def index_in_image(self) -> IntArray:
         """Return the place of every observation in the list of its image, (N,)."""

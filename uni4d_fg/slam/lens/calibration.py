@@ -17,8 +17,9 @@ from typing import cast
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, evenly_spread
+from uni4d_fg.arrays import BoolArray, FloatArray, evenly_spread
 from uni4d_fg.config.models import Config
+from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
@@ -94,6 +95,8 @@ def calibrate_lens(
     """
     settings = config.camera
     count = labelled.tracks.num_frames
+    if not (labelled.weight[_static(labelled)] > 0).any():
+        raise DegenerateProblemError("the lens: there is no static track")
     frames = calibration_frames(TrackSpans.of(labelled), count, settings.frames, config.windows.calibration_sightings)
     some = tracks_in(_thinned(labelled, settings.observations * count // len(frames)), frames).labelled
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0
@@ -141,9 +144,13 @@ def _candidate(fit: FittedLens, held_out_gain: float, image_size: tuple[int, int
     return LensCandidate(fit.lens, fit.intrinsics, fit.evidence, held_out_gain, displacement)
 
 
+def _static(labelled: LabelledTracks) -> BoolArray:
+    return np.isin(labelled.label, [int(TrackLabel.STATIC), int(TrackLabel.SHORT_STATIC)])
+
+
 def _thinned(labelled: LabelledTracks, observations: int) -> LabelledTracks:
     """Keep evenly spread static tracks with about so many observations in all."""
-    rows = np.flatnonzero(np.isin(labelled.label, [int(TrackLabel.STATIC), int(TrackLabel.SHORT_STATIC)]))
+    rows = np.flatnonzero(_static(labelled))
     count = int((labelled.weight[rows] > 0).sum())
     if count > observations:
         rows = rows[evenly_spread(len(rows), max(1, len(rows) * observations // count))]

@@ -9,7 +9,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.errors import DegenerateProblemError, SolverError
+from uni4d_fg.errors import Cancelled, DegenerateProblemError, SolverError
 from uni4d_fg.factors.camera_priors import fisheye_camera_prior, opencv_camera_prior
 from uni4d_fg.factors.factor_type import FactorType
 from uni4d_fg.factors.lens_reprojection import fisheye_reprojection, opencv_reprojection
@@ -22,7 +22,7 @@ from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
-from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.lens.tracks import ideal_tracks, ideal_weight
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
@@ -90,8 +90,14 @@ class LensFit:
         solver = StaticSceneSolver(self.config, self.run, self.hooks)
         ideal = ideal_tracks(self.tracks, intrinsics, lens)
         found = solver.solve(ideal, intrinsics, self.prior_intrinsics, free_intrinsics=True)
-        self.solves += found.solves
+        self._note(found.solves)
         return found
+
+    def _note(self, solves: list[SolveSummary]) -> None:
+        """Remember solves. Raises Cancelled if the user interrupted one."""
+        self.solves += solves
+        if any(solve.termination is Termination.CANCELLED for solve in solves):
+            raise Cancelled("stopped while the lens was sought")
 
     def search(self, starts: tuple[float, ...]) -> FittedLens:
         """Return the best of several k1, each undone before stages 1 and 2 run from the given intrinsics.
@@ -162,10 +168,11 @@ class LensFit:
         pixel = [] if ba.free_principal_point else [2, 3]
         held = Stage("lens", replace(problem).fix(variable, entries=[*pixel, 4, 5, 6, 7]), solver, part="held")
         state, before = self.run(held, state, self.hooks)
+        self._note([before])
         unused = range(4 + len(PARAMETERS[model]), 8)
         free = Stage("lens", replace(problem).fix(variable, entries=[*pixel, *unused]), solver, part=model)
         state, after = self.run(free, state, self.hooks)
-        self.solves += [before, after]
+        self._note([after])
         camera = state[variable][0]
         cameras = Cameras(state[POSE], camera[:4], state[LOG_SCALE][:, 0])
         moved = replace(scene, cameras=cameras, landmarks=state[LANDMARK])

@@ -1,0 +1,132 @@
+"""The lens found with the cameras, on synthetic scenes: what was put in comes out, and a pinhole stays one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.config.models import Config
+from uni4d_fg.config.synthetic import SyntheticSceneConfig
+from uni4d_fg.errors import DegenerateProblemError
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.frontend.tracks.labels import label_tracks
+from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.results.evaluate.run import evaluate_run
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.incremental import IncrementalReconstructor
+from uni4d_fg.slam.incremental.model import FrameTracks
+from uni4d_fg.slam.lens.calibration import calibrate_lens
+from uni4d_fg.slam.lens.tracks import ideal_tracks
+
+pytest.importorskip("open3d")
+
+QUIET = ("output.clouds=false", "output.pictures=false")
+
+
+def config(*changes: str) -> Config:
+    return load_config("default", [*QUIET, *changes])
+
+
+def scene(lens: Lens, **more: object) -> Sequence:
+    made = SyntheticSceneConfig(
+        num_frames=20, render_images=False, camera_model=lens.model, distortion=lens.parameters, **more
+    )
+    return make_synthetic_sequence(made)
+
+
+def labelled(sequence: Sequence) -> LabelledTracks:
+    settings = config()
+    assert sequence.tracks is not None
+    return label_tracks(sequence.tracks, sequence, settings.labels, settings.input)
+
+
+@pytest.fixture(scope="module")
+def barrel() -> Sequence:
+    return scene(Lens("SIMPLE_RADIAL", (-0.2,)))
+
+
+def test_barrel_distortion_is_found(barrel: Sequence) -> None:
+    found = calibrate_lens(labelled(barrel), barrel.image_size, barrel.intrinsics, config())
+    assert found.lens.model == "SIMPLE_RADIAL"
+    assert found.lens.parameters[0] == pytest.approx(-0.2, abs=0.02)
+    assert found.intrinsics[0] == pytest.approx(300.0, rel=0.02)  # given 315
+    assert found.candidates[0].evidence > config().camera.min_evidence
+    assert found.facts()[0].startswith(f"camera model SIMPLE_RADIAL, k1 {found.lens.parameters[0]:.4f}, fx ")
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_pinhole_stays_one(seed: int) -> None:
+    sequence = scene(PINHOLE, seed=seed)
+    found = calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config())
+    assert found.lens == PINHOLE
+    np.testing.assert_array_equal(found.intrinsics, sequence.intrinsics)
+    assert len(found.solves) < 60  # of stage 1, of stage 2, and two of a few steps
+
+
+def test_without_static_tracks_there_is_nothing_to_find(barrel: Sequence) -> None:
+    tracks = labelled(barrel)
+    with pytest.raises(DegenerateProblemError, match="the lens: there is no static track"):
+        calibrate_lens(tracks.without(np.ones(len(tracks.label), bool)), barrel.image_size, barrel.intrinsics, config())
+
+
+def test_ideal_tracks_are_those_of_the_pinhole(barrel: Sequence) -> None:
+    truth = barrel.ground_truth.intrinsics
+    assert truth is not None
+    real = labelled(barrel)
+    ideal = ideal_tracks(real, truth, Lens("SIMPLE_RADIAL", (-0.2,)))
+    straight = scene(PINHOLE)
+    assert straight.tracks is not None
+    # The same surface points are not tracked, but a straight line of the room is straight again: radii grow.
+    radius = [np.linalg.norm(t.tracks.uv[t.weight > 0] - truth[2:], axis=1) for t in (real, ideal)]
+    assert radius[1].max() > 1.1 * radius[0].max()
+    assert (ideal.weight <= real.weight).all()
+    assert ideal_tracks(real, truth, PINHOLE) is real
+
+
+def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_path: Path) -> None:
+    errors = {}
+    for name, sequence in (("straight", scene(PINHOLE)), ("barrel", barrel)):
+        reconstruct(sequence, tmp_path / name, config())
+        errors[name] = evaluate_run(tmp_path / name, sequence).to_dict()["trajectory"]["ate_m"]
+    assert errors["barrel"] < 1.3 * errors["straight"] + 2e-4
+    result = load_reconstruction(RunFolder(tmp_path / "barrel").reconstruction)
+    assert result.lens.model == "SIMPLE_RADIAL"
+    again = reconstruct(barrel, tmp_path / "barrel", config(), resume=True)
+    assert all(again.stages[name]["resumed"] for name in ("tracks", "lens", "bundle_adjustment", "nonrigid"))
+    held = reconstruct(barrel, tmp_path / "barrel", config("camera.model=pinhole"), resume=True)
+    assert "lens" not in held.stages
+    assert not held.stages["bundle_adjustment"]["resumed"]
+
+
+def test_a_fisheye_of_140_degrees(tmp_path: Path) -> None:
+    sequence = scene(Lens("OPENCV_FISHEYE", (0.02, -0.005, 0.0, 0.0)), focal=131.0)
+    reconstruct(sequence, tmp_path, config("camera.model=opencv_fisheye"))
+    found = evaluate_run(tmp_path, sequence).to_dict()["trajectory"]
+    assert found["ate_m"] < 0.003 * found["path_length_reference_m"]
+    assert load_reconstruction(RunFolder(tmp_path).reconstruction).intrinsics[0] == pytest.approx(131.0, rel=0.01)
+
+
+def test_a_stream_takes_a_known_lens(barrel: Sequence) -> None:
+    tracks, truth = barrel.tracks, barrel.ground_truth
+    assert tracks is not None
+    assert truth.intrinsics is not None
+    assert truth.world_T_cam is not None
+    solver = IncrementalReconstructor(
+        truth.intrinsics, barrel.image_size, load_config("default"), lens=Lens("SIMPLE_RADIAL", (-0.2,))
+    )
+    for t in range(barrel.num_frames):
+        seen = np.flatnonzero(tracks.visible[:, t])
+        here = FrameTracks(seen.astype(np.int64), tracks.uv[seen, t].astype(np.float64))
+        solver.add_frame(barrel.images[t], barrel.depths[t], barrel.masks[t], here, float(barrel.timestamps[t]))
+    result = solver.finish()
+    expected = np.linalg.inv(truth.world_T_cam[0]) @ truth.world_T_cam
+    assert np.abs(result.world_T_cam[:, :3, 3] - expected[:, :3, 3]).max() < 0.02
+    assert result.lens == Lens("SIMPLE_RADIAL", (-0.2,))
+    np.testing.assert_array_equal(result.intrinsics, truth.intrinsics)  # held: the lens belongs to them
