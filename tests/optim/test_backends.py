@@ -99,6 +99,11 @@ def test_the_extension_solves_every_stage(small_scene: Sequence, tmp_path: Path)
             "C++ landmark elimination": {"static_reprojection", "depth_prior"},
             "NumPy, on what is not eliminated": {"log_scale_prior"},
         },
+        "lens": {
+            "C++ landmark elimination": {"depth_prior"},
+            "linearized blocks in the C++ landmark elimination": {"static_reprojection"},
+            "NumPy, on what is not eliminated": cameras - {"aspect_prior"},
+        },
         "nonrigid": {"C++ trajectories": {"dynamic_reprojection", "depth_prior", "smoothness", "arap"}},
     }
 

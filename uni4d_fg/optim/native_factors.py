@@ -54,14 +54,19 @@ def _native_batch(
 ) -> FactorBatch:
     """Return one batch; its datum ``number`` (N,) tells which of the factors a row is."""
     keys = [list(item.keys()) for item in factors]
+    # Half the square of a Gaussian's whitened error is its energy: no kernel comes between.
+    gaussian_noise = [_is_gaussian(item) for item in factors]
 
     def values_of(arguments: tuple[FloatArray, ...], number: IntArray) -> gtsam.Values:
-        values = gtsam.Values()
+        values, seen = gtsam.Values(), set[int]()
         for slot, (variable, array) in enumerate(zip(variables, arguments, strict=True)):
             if not isinstance(array, np.ndarray):
                 raise SolverError(f"{name} is a factor of GTSAM's, which Adam cannot differentiate; use solver 'lm'")
             for row, n in enumerate(number.tolist()):
-                values.insert_or_assign(keys[n][slot], variable.to_gtsam(array[row]))
+                key = keys[n][slot]
+                if key not in seen:
+                    seen.add(key)
+                    values.insert(key, variable.to_gtsam(array[row]))
         return values
 
     def residual(*arguments: Array, number: Array) -> Array:
@@ -70,8 +75,12 @@ def _native_batch(
         values = values_of(arguments, number)
         out = np.zeros((len(number), dim))
         for row, n in enumerate(number.tolist()):
-            item, size = factors[n], np.sqrt(2.0 * factors[n].error(values))
+            item = factors[n]
             error = np.asarray(item.whitenedError(values)) if hasattr(item, "whitenedError") else np.ones(dim)
+            if gaussian_noise[n]:
+                out[row] = error
+                continue
+            size = np.sqrt(2.0 * item.error(values))
             norm = float(np.linalg.norm(error))
             out[row] = error * (size / norm) if norm > 0.0 else 0.0
         return out
@@ -104,3 +113,9 @@ def _native_batch(
     factor_type = FactorType(name, variables, {"number": ()}, dim, residual, linearize, native=native, listed=False)
     slots = tuple(Slot(variable, rows[:, i]) for i, variable in enumerate(variables))
     return FactorBatch.create(factor_type, slots, {"number": np.arange(len(factors), dtype=np.float64)})
+
+
+def _is_gaussian(item: Any) -> bool:
+    """Return whether a factor's noise is Gaussian without a robust kernel, and its whitened error is to be had."""
+    noise = item.noiseModel() if hasattr(item, "noiseModel") and hasattr(item, "whitenedError") else None
+    return isinstance(noise, gtsam.noiseModel.Gaussian)

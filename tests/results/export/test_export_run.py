@@ -18,7 +18,7 @@ from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.results.export import export_run
 from uni4d_fg.results.export import run as export_module
 from uni4d_fg.results.export.frames import frame_names, write_images
-from uni4d_fg.results.export.model import Exporter, ExportJob
+from uni4d_fg.results.export.model import Exporter, ExportJob, ExportOptions
 from uni4d_fg.results.export.registry import FORMATS
 from uni4d_fg.results.run import Run
 
