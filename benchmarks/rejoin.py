@@ -42,6 +42,7 @@ class Recorded:
     seconds: float = 0.0
 
     def __call__(self, state: State, observations: Observations, noise: StaticNoise) -> np.ndarray:
+        """Search, as the solve asks for it."""
         began = time.perf_counter()
         self.track, self.name = observations.rows()[0], self.search(state, observations, noise)
         self.seconds = time.perf_counter() - began
@@ -66,7 +67,8 @@ class Score:
 def score(recorded: Recorded, occluded: Occluded) -> Score:
     """Count joins; each is a track that is named by another one."""
     track, name = recorded.track, recorded.name
-    assert track is not None and name is not None
+    assert track is not None
+    assert name is not None
     there = np.isin(occluded.earlier, track) & np.isin(occluded.later, track)
     origin = np.arange(int(track.max()) + 1)
     continued = occluded.later[there]

@@ -27,6 +27,8 @@ from uni4d_fg.slam.association.candidates import Candidates
 from uni4d_fg.slam.stages.observations import Observations
 
 _SEARCH_PX = 2
+_NEAREST_VIEW, _FARTHEST_VIEW = 0.1, 0.6
+"""The compared views, as parts of a fragment's observations counted from the gap."""
 _CHUNK = 512
 """Pairs that are compared at once, for the sake of memory."""
 _LARGEST_STRETCH = 2.0
@@ -70,8 +72,8 @@ def compare(
     half = config.patch_px // 2
     reach = int(np.ceil(half * _LARGEST_STRETCH))
     cutter = _Cutter(images, raw_uv, state, observations)
-    # Views are spread from the gap into each fragment: right at the gap what hides the point is often in the patch.
-    for view in np.linspace(0.0, 0.5, config.views):
+    # Views are spread over each fragment: right at the gap, what hides the point is often in the patch.
+    for view in np.linspace(_NEAREST_VIEW, _FARTHEST_VIEW, config.views):
         source = start[pairs.earlier] + ((1.0 - view) * (count[pairs.earlier] - 1)).astype(np.int64)
         target = start[pairs.later] + (view * (count[pairs.later] - 1)).astype(np.int64)
         stretch, usable = _stretch(state, observations, source, target, pairs.earlier)
@@ -102,17 +104,21 @@ class _Cutter:
         seen = self.observations.select(observation)
         x = world_to_camera(self.state[POSE][seen.frame], self.state[LANDMARK][landmark])
         center = self.raw_uv[seen.track, seen.frame] + (project(self.state[INTRINSICS][0], x) - seen.uv)
-        side = 2 * reach + 1
+        side, grid = 2 * reach + 1, np.arange(-reach, reach + 1)
         out = np.full((len(seen), side, side), np.nan, np.float32)
         for frame in np.unique(seen.frame):
             image = self.images[int(frame)]
             gray = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-            limit = np.array(gray.shape[::-1]) - 1 - reach
+            size = np.array(gray.shape[::-1])
             members = np.flatnonzero(seen.frame == frame)
-            inside = ((center[members] >= reach) & (center[members] <= limit)).all(axis=1)
+            inside = ((center[members] >= 0) & (center[members] <= size - 1)).all(axis=1)
             for n in members[inside]:
                 u, v = center[n].tolist()
                 out[n] = cv2.getRectSubPix(gray, (side, side), (u, v), patchType=cv2.CV_32F)
+                if not (reach <= u <= size[0] - 1 - reach and reach <= v <= size[1] - 1 - reach):
+                    column, line = u + grid, v + grid
+                    out[n][:, (column < 0) | (column > size[0] - 1)] = np.nan
+                    out[n][(line < 0) | (line > size[1] - 1)] = np.nan
         return out
 
 

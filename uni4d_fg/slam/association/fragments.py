@@ -16,6 +16,9 @@ from uni4d_fg.slam.association.candidates import Candidates, find_candidates
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
+_OFFSET_SIGMA_PX = 0.4
+"""How well a patch tells where its point is, against the sigmas of the positions."""
+
 
 @dataclass(frozen=True)
 class FragmentSearch:
@@ -38,8 +41,9 @@ class FragmentSearch:
         pairs = find_candidates(state, observations, noise, self.config)
         seen = compare(self.images, self.raw_uv, state, observations, pairs, self.config)
         alike = (seen.correlation >= self.config.min_correlation) & (seen.offset_px <= self.config.max_offset_px)
-        cost = pairs.distance + (seen.offset_px / self.config.max_offset_px) ** 2 - seen.correlation
-        best = alike & mutual_best(pairs, np.where(alike, cost, np.inf))
+        cost = pairs.distance + (seen.offset_px / _OFFSET_SIGMA_PX) ** 2
+        # Best by position among all, too: a neighbor must not take the place of one whose patch could not be compared.
+        best = mutual_best(pairs, pairs.distance) & mutual_best(pairs, np.where(alike, cost, np.inf))
         order = np.flatnonzero(best)[np.argsort(cost[best], kind="stable")]
         return tracks[group_pairs(pairs.select(order), observations)]
 
