@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uni4d_fg.arrays import IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.frontend.sequence.model import ArrayFrames, GroundTruth, Sequence
 from uni4d_fg.frontend.track_model import Tracks
 
@@ -49,9 +49,10 @@ def pass_bar(sequence: Sequence, hidden: int, first: int = 5) -> Occluded:
     for frame in range(num_frames):
         images[frame][:, (column >= back[frame]) & (column < front[frame])] = _GRAY
     tracks = sequence.tracks
-    u = tracks.uv[..., 0]
+    u: FloatArray = tracks.uv[..., 0].astype(np.float64)
     with np.errstate(invalid="ignore"):
-        before, behind = tracks.visible & (u >= front), tracks.visible & (u < back)
+        before: BoolArray = tracks.visible & (u >= front)
+        behind: BoolArray = tracks.visible & (u < back)
     earlier = np.flatnonzero(before.any(axis=1) & behind.any(axis=1))
     # A track that is seen only behind the bar keeps its number.
     kept = np.where(before.any(axis=1)[:, None], before, behind)

@@ -21,7 +21,7 @@ from uni4d_fg.factors.static_reprojection import static_reprojection_jacobian
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.slam.stages.observations import Observations
-from uni4d_fg.slam.stages.scene import StaticNoise
+from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
 
 _PRIOR_SIGMA_M = 1e3
 """Keeps the information of a point without depth and parallax invertible."""
@@ -59,12 +59,15 @@ def find_candidates(state: State, observations: Observations, noise: StaticNoise
     pairs = pairs[~_seen_together(observations, pairs)]
     earlier, later = pairs[:, 0], pairs[:, 1]
     difference = state[LANDMARK][later] - state[LANDMARK][earlier]
-    covariance = landmark_covariances(state, observations, noise)
-    _, row = observations.rows()
+    tracks, row = observations.rows()
+    involved, place = np.unique(pairs, return_inverse=True)
+    compared = Cameras.of(state).state(state[LANDMARK][involved], tracks[involved])
+    covariance = landmark_covariances(compared, observations.select(np.isin(row, involved)), noise)
+    covariance = covariance[place.reshape(-1, 2)]
     first = observations.frame[np.searchsorted(row, later)]
     z = world_to_camera(state[POSE][first], state[LANDMARK][later])[:, 2]
     slack = (np.maximum(z, NEAR_PLANE) * config.camera_sigma_px / state[INTRINSICS][0, 0]) ** 2
-    spread = covariance[earlier] + covariance[later] + slack[:, None, None] * np.eye(3)
+    spread = covariance.sum(axis=1) + slack[:, None, None] * np.eye(3)
     distance = np.einsum("pi,pi->p", difference, np.linalg.solve(spread, difference[:, :, None])[:, :, 0])
     return Candidates(earlier, later, distance).select(distance <= config.max_sigmas**2)
 
@@ -84,8 +87,7 @@ def landmark_covariances(state: State, observations: Observations, noise: Static
     information += np.einsum("ni,nj,n->nij", axis, axis, known)
     total = np.zeros((len(tracks), 3, 3))
     np.add.at(total, row, information)
-    result: FloatArray = np.linalg.inv(total + np.eye(3) / _PRIOR_SIGMA_M**2)
-    return result
+    return np.asarray(np.linalg.inv(total + np.eye(3) / _PRIOR_SIGMA_M**2), dtype=np.float64)
 
 
 def _near_in_the_image(state: State, observations: Observations, radius_px: float) -> IntArray:

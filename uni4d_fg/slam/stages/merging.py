@@ -62,7 +62,7 @@ def merge_tracks(state: State, observations: Observations, name: IntArray) -> tu
         name: (N,) track that names the point of each landmark.
     """
     _, row = observations.rows()
-    weight = np.bincount(row, observations.weight, len(name))
+    weight = np.bincount(row, observations.weight, len(name)).astype(np.float64)
     points, group = np.unique(name, return_inverse=True)
     landmarks = mean_per_row(state[LANDMARK], weight, group, len(points))
     renamed = replace(observations, track=name[row])
