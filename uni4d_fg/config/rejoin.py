@@ -25,6 +25,9 @@ class RejoinConfig(Section):
     max_offset_px: float = setting(
         1.0, "Largest distance between the landmarks' projection and the best match of the patches, px.", gt=0, le=2
     )
+    min_probability: float = setting(
+        0.7, "Probability that a pair needs against all others of its two tracks.", ge=0.5, lt=1, basic=True
+    )
     min_contrast: float = setting(
         3.0, "Standard deviation of gray levels that a patch needs to be told from others.", ge=0
     )

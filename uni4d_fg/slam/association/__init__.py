@@ -2,5 +2,5 @@
 
 candidates: pairs of landmarks that may be one point, by their positions and uncertainty;
 appearance: patches of both, compared under the solved geometry;
-fragments: mutual best pairs, joined to groups.
+fragments: pairs that no other contends, joined to groups.
 """

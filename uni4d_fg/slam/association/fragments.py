@@ -1,4 +1,4 @@
-"""Which tracks are fragments of one point: mutual best among the pairs that look the same."""
+"""Which tracks are fragments of one point: pairs that look the same, and that no other pair contends."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.rejoin import RejoinConfig
 from uni4d_fg.factors.state import State
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.slam.association.appearance import compare
+from uni4d_fg.slam.association.appearance import Likeness, compare
 from uni4d_fg.slam.association.candidates import Candidates, find_candidates
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
 _OFFSET_SIGMA_PX = 0.4
 """How well a patch tells where its point is, against the sigmas of the positions."""
+_UNLIKE = 4.0
+"""Added to the cost of a pair whose patches were compared and differ."""
 
 
 @dataclass(frozen=True)
@@ -41,21 +43,34 @@ class FragmentSearch:
         pairs = find_candidates(state, observations, noise, self.config)
         seen = compare(self.images, self.raw_uv, state, observations, pairs, self.config)
         alike = (seen.correlation >= self.config.min_correlation) & (seen.offset_px <= self.config.max_offset_px)
-        cost = pairs.distance + (seen.offset_px / _OFFSET_SIGMA_PX) ** 2
-        # Best by position among all, too: a neighbor must not take the place of one whose patch could not be compared.
-        best = mutual_best(pairs, pairs.distance) & mutual_best(pairs, np.where(alike, cost, np.inf))
-        order = np.flatnonzero(best)[np.argsort(cost[best], kind="stable")]
+        probability = pair_probability(pairs, association_cost(pairs, seen, self.config))
+        best = np.flatnonzero(alike & (probability >= self.config.min_probability))
+        order = best[np.argsort(-probability[best], kind="stable")]
         return tracks[group_pairs(pairs.select(order), observations)]
 
 
-def mutual_best(pairs: Candidates, cost: FloatArray) -> BoolArray:
-    """Return which pairs (P,) are the cheapest both of their earlier track and of their later one."""
-    result = np.ones(len(pairs), np.bool_)
-    for side in (pairs.earlier, pairs.later):
-        lowest = np.full(int(side.max(initial=0)) + 1, np.inf)
-        np.minimum.at(lowest, side, cost)
-        result &= cost <= lowest[side]
-    return result & np.isfinite(cost)
+def association_cost(pairs: Candidates, seen: Likeness, config: RejoinConfig) -> FloatArray:
+    """Return minus twice the logarithm of each pair's likelihood, (P,), up to a constant.
+
+    The position's squared Mahalanobis distance and that of the best match of the patches. A pair whose patches cannot
+    be compared counts with its position and the mean of the other part: it may still be the right one.
+    """
+    compared = np.isfinite(seen.offset_px)
+    cost = pairs.distance + np.where(compared, np.where(compared, seen.offset_px, 0.0) / _OFFSET_SIGMA_PX, 1.0) ** 2
+    cost[compared & (seen.correlation < config.min_correlation)] += _UNLIKE
+    return cost
+
+
+def pair_probability(pairs: Candidates, cost: FloatArray) -> FloatArray:
+    """Return how probable each pair is among all that share a track with it, (P,).
+
+    ``L / sum L`` with ``L = exp(-cost / 2)``, over the pairs of either track: above one half it is the best of both,
+    so that what passes is one-to-one. Source: joint probabilistic data association, Fortmann et al. 1983.
+    """
+    likelihood = np.exp(-0.5 * cost)
+    total = sum(np.bincount(side, likelihood)[side] for side in (pairs.earlier, pairs.later)) - likelihood
+    result: FloatArray = likelihood / np.maximum(total, np.finfo(np.float64).tiny)
+    return result
 
 
 def group_pairs(pairs: Candidates, observations: Observations) -> IntArray:
