@@ -53,9 +53,10 @@ def pass_bar(sequence: Sequence, hidden: int, first: int = 5) -> Occluded:
     with np.errstate(invalid="ignore"):
         before: BoolArray = tracks.visible & (u >= front)
         behind: BoolArray = tracks.visible & (u < back)
-    earlier = np.flatnonzero(before.any(axis=1) & behind.any(axis=1))
+    ahead: BoolArray = np.asarray(before.any(axis=1))
+    earlier = np.flatnonzero(ahead & behind.any(axis=1))
     # A track that is seen only behind the bar keeps its number.
-    kept = np.where(before.any(axis=1)[:, None], before, behind)
+    kept: BoolArray = np.where(ahead[:, None], before, behind)
     visible = np.concatenate((kept, behind[earlier]))
     rows = np.concatenate((np.arange(len(kept)), earlier))
     seen = np.flatnonzero(visible.any(axis=1))

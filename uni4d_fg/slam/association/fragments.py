@@ -46,7 +46,8 @@ class FragmentSearch:
         probability = pair_probability(pairs, association_cost(pairs, seen, self.config))
         best = np.flatnonzero(alike & (probability >= self.config.min_probability))
         order = best[np.argsort(-probability[best], kind="stable")]
-        return tracks[group_pairs(pairs.select(order), observations)]
+        named: IntArray = tracks[group_pairs(pairs.select(order), observations)]
+        return named
 
 
 def association_cost(pairs: Candidates, seen: Likeness, config: RejoinConfig) -> FloatArray:
@@ -56,7 +57,9 @@ def association_cost(pairs: Candidates, seen: Likeness, config: RejoinConfig) ->
     be compared counts with its position and the mean of the other part: it may still be the right one.
     """
     compared = np.isfinite(seen.offset_px)
-    cost = pairs.distance + np.where(compared, np.where(compared, seen.offset_px, 0.0) / _OFFSET_SIGMA_PX, 1.0) ** 2
+    cost: FloatArray = (
+        pairs.distance + np.where(compared, np.where(compared, seen.offset_px, 0.0) / _OFFSET_SIGMA_PX, 1.0) ** 2
+    )
     cost[compared & (seen.correlation < config.min_correlation)] += _UNLIKE
     return cost
 
