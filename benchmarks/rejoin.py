@@ -4,8 +4,7 @@
 
 A bar passes in front of a synthetic scene and hides every point for a while; tracks continue behind it under new
 numbers. A join is right if both tracks are the same material point. Recall counts the static points that have a
-landmark on both sides. The drift rows are without camera noise in the tracks' favor: ATE of the same scene without and
-with joins, and with the tracks never cut.
+landmark on both sides. ATE is that of the same scene with its tracks cut, cut and joined, and never cut.
 """
 
 from __future__ import annotations

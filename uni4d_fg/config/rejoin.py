@@ -12,7 +12,6 @@ class RejoinConfig(Section):
         True,
         "Join fragments between the two solves of bundle adjustment, so that the second one has one landmark for each "
         "point. One graph with energy 'map' and measured noise only; not in windows and streams.",
-        basic=True,
     )
     max_distance_px: float = setting(
         3.0, "Landmarks farther apart than this in the frame where the later track starts are not compared, px.", gt=0
@@ -26,7 +25,7 @@ class RejoinConfig(Section):
         1.0, "Largest distance between the landmarks' projection and the best match of the patches, px.", gt=0, le=2
     )
     min_probability: float = setting(
-        0.7, "Probability that a pair needs against all others of its two tracks.", ge=0.5, lt=1, basic=True
+        0.7, "Probability that a pair needs against all others of its two tracks.", ge=0.5, lt=1
     )
     min_contrast: float = setting(
         3.0, "Standard deviation of gray levels that a patch needs to be told from others.", ge=0
