@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from uni4d_fg.config.base import Section, setting
+from uni4d_fg.config.rejoin import RejoinConfig
 from uni4d_fg.config.solver import KernelConfig, SolverConfig
 
 
@@ -119,6 +120,7 @@ class BundleAdjustmentConfig(Section):
     drift_frames: float = setting(
         30.0, "A track's observation this many frames from its query frame has twice the variance (tracks drift).", gt=0
     )
+    rejoin: RejoinConfig = setting(RejoinConfig(), "Tracks that were lost and found again.")
     covariance_cells: int = setting(
         5,
         "Static tracks that start in the same cell, of this many along the longer image side, may err alike in any "

@@ -45,6 +45,7 @@ from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.labels_io import load_labels, save_labels
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.association.fragments import FragmentSearch
 from uni4d_fg.slam.windows.plan import Window, windows_of
 
 ValueT = TypeVar("ValueT")
@@ -202,7 +203,8 @@ def _reconstruct(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
     key, camera = _camera(run, key, labelled)
-    key, scene, motion = _stages(run, key, *camera.apply(sequence, labelled, config), windows, run_stage)
+    fragments = FragmentSearch.of(sequence, labelled, config.bundle_adjustment.rejoin)
+    key, scene, motion = _stages(run, key, *camera.apply(sequence, labelled, config), windows, run_stage, fragments)
     adjusted = summary.stages["bundle_adjustment"]
     adjusted["facts"] = [*adjusted.get("facts", []), *measured.facts]
     key = stage_key(key, config.fusion)
@@ -240,6 +242,7 @@ def _stages(
     config: Config,
     windows: list[Window],
     run_stage: StageRunner,
+    fragments: FragmentSearch | None,
 ) -> tuple[str, Arrays, Arrays]:
     """Run stages 1 to 3, as one graph or in windows, and the joint solve.
 
@@ -267,7 +270,7 @@ def _stages(
     scene = run.step(
         "bundle_adjustment",
         key,
-        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage, run.imu),
+        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage, run.imu, fragments),
     )
     key = stage_key(key, config.nonrigid, *_searched(config))
     motion = run.step(

@@ -32,6 +32,7 @@ from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy, energy_of
 from uni4d_fg.slam.stages.local_scale import predict_log_scale
+from uni4d_fg.slam.stages.merging import FindFragments
 from uni4d_fg.slam.stages.nonrigid import solve_nonrigid
 from uni4d_fg.slam.stages.observations import Observations, observations_of
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise, StaticScene
@@ -94,18 +95,21 @@ def bundle_adjustment_step(
     hooks: Hooks,
     run: StageRunner = run_stage,
     imu: ImuSamples | None = None,
+    find_fragments: FindFragments | None = None,
 ) -> StageRecord:
     """Stage 2; with fixed poses and no static track the given cameras are kept as they are.
 
-    With an IMU it is solved twice: without it, and from there with it.
+    With an IMU it is solved twice: without it, and from there with it. With ``find_fragments`` tracks of one point are
+    one landmark in the last solve.
     """
     fixed = config.input.poses == "fixed"
     start = Cameras(cameras["world_T_cam"], cameras["intrinsics"], np.zeros(len(cameras["world_T_cam"])))
     freedom = Freedom(poses=not fixed, intrinsics=config.input.intrinsics == "free")
     if imu is not None:
-        return _with_imu(sequence, labelled, start, freedom, config, hooks, run, imu)
+        return _with_imu(sequence, labelled, start, freedom, config, hooks, run, imu, find_fragments)
     try:
-        scene = StaticSceneSolver(config, run, hooks).adjust(labelled, start, sequence.intrinsics, freedom)
+        solver = StaticSceneSolver(config, run, hooks, find_fragments=find_fragments)
+        scene = solver.adjust(labelled, start, sequence.intrinsics, freedom)
     except DegenerateProblemError as reason:
         if not fixed:
             raise
@@ -123,12 +127,14 @@ def _with_imu(
     hooks: Hooks,
     run: StageRunner,
     imu: ImuSamples,
+    find_fragments: FindFragments | None,
 ) -> StageRecord:
     prior = sequence.intrinsics
     first = start_with_imu(labelled, start, prior, freedom, sequence.timestamps, imu, config, hooks, run)
     stop_if_cancelled(first.solves)
     adding = adding_to(run, [first.source])
-    scene = StaticSceneSolver(config, adding, hooks).adjust(labelled, first.cameras, prior, freedom)
+    solver = StaticSceneSolver(config, adding, hooks, find_fragments=find_fragments)
+    scene = solver.adjust(labelled, first.cameras, prior, freedom)
     stop_if_cancelled(scene.solves)
     summary = _scene_summary(sequence, replace(scene, solves=[*first.solves, *scene.solves]), config)
     summary["imu"] = imu_summary(first, adding)
@@ -154,6 +160,9 @@ def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
 def _scene_summary(sequence: Sequence, scene: StaticScene, config: Config) -> dict[str, Any]:
     solves = [solve_dict(s) for s in scene.solves]
     summary = bundle_summary(sequence, scene_arrays(scene), len(scene.observations), scene.dropped, solves)
+    if scene.joined:
+        summary["joined_tracks"] = scene.joined
+        summary["facts"].append(f"{scene.joined} tracks joined to earlier ones of the same point")
     summary["exact_energy"] = paper_energy(scene, config.normalization)
     return summary
 

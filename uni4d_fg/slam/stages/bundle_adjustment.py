@@ -2,8 +2,8 @@
 
 Landmarks start at the mean lift of their depth cues. With the MAP energy a first solve uses the configured
 sigmas; observations that disagree are dropped, the noise of reprojection and of depth is measured on what
-stays, and a second solve uses it. Frame 0's pose is the gauge; the depth prior (or, without it, the distance
-of the two farthest cameras) holds the scale.
+stays, and a second solve uses it; in that one, tracks that are fragments of one point share a landmark. Frame 0's pose
+is the gauge; the depth prior (or, without it, the distance of the two farthest cameras) holds the scale.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
 from uni4d_fg.slam.stages.lifting import lift, mean_per_row
+from uni4d_fg.slam.stages.merging import FindFragments, MergedTracks, merge_tracks
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
 from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
@@ -168,6 +169,7 @@ def adjust_bundle(
     energy: Energy = MAP,
     hooks: Hooks | None = None,
     run: StageRunner = run_stage,
+    find_fragments: FindFragments | None = None,
 ) -> StaticScene:
     """Run stage 2 from the poses and intrinsics of stage 1.
 
@@ -180,6 +182,7 @@ def adjust_bundle(
         energy: Weighs the terms.
         hooks: Progress and cancellation.
         run: What solves each declared stage.
+        find_fragments: Finds tracks that are one point, before the second solve; None leaves every track its own.
 
     Raises:
         DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
@@ -195,6 +198,7 @@ def adjust_bundle(
     state = start.state(landmarks, observations.rows()[0])
     noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma, config.depth_correlation)
     solves: list[SolveSummary] = []
+    merged: MergedTracks | None = None
     covariances = unknown_covariances(len(start.world_T_cam))
     rounds = 2 if energy.is_likelihood and config.measure_noise else 1
     for index in range(rounds):
@@ -216,6 +220,8 @@ def adjust_bundle(
                 "check intrinsics and masks, or raise max_reprojection_px and max_depth_ratio"
             )
         noise = measure_noise(state, observations, noise, config)
+        if find_fragments is not None and index < rounds - 1:
+            state, observations, merged = merge_tracks(state, observations, find_fragments(state, observations, noise))
     if config.structure == "refine" and energy.is_likelihood and solves[-1].termination is not Termination.CANCELLED:
         state, noise, refined = refine_structure(state, observations, noise, config, hooks, run)
         solves += refined
@@ -231,10 +237,11 @@ def adjust_bundle(
     track = state.numbers(LANDMARK)[:, 0]
     error = landmark_errors(state, observations)[keep]
     observations = observations.select(np.isin(observations.track, track[keep]))
-    return StaticScene(
+    scene = StaticScene(
         Cameras.of(state), state[LANDMARK][keep], track[keep], observations, noise, error,
         *covariances, solves, dropped,
     )  # fmt: skip
+    return scene if merged is None else merged.split(scene)
 
 
 def refine_structure(

@@ -92,6 +92,8 @@ class StaticScene:
     solves: list[SolveSummary] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     """Number of observations or landmarks dropped, per reason."""
+    joined: int = 0
+    """Number of tracks that were solved as part of another one's landmark; they have its position."""
 
     def state(self) -> State:
         """Return the variables of the scene."""

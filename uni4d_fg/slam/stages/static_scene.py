@@ -18,6 +18,7 @@ from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, adjust_bundle
 from uni4d_fg.slam.stages.camera_init import CameraInitResult, initialize_cameras
 from uni4d_fg.slam.stages.energy import energy_of
+from uni4d_fg.slam.stages.merging import FindFragments
 from uni4d_fg.slam.stages.observations import Observations, observations_of, weigh_by_drift
 from uni4d_fg.slam.stages.scene import Cameras, StaticScene
 
@@ -34,6 +35,8 @@ class StaticSceneSolver:
     """Progress and cancellation."""
     observations_per_frame: int | None = None
     """Bundle adjustment takes evenly spread tracks with about this many observations per frame; all when None."""
+    find_fragments: FindFragments | None = None
+    """Joins tracks that are one point, see :func:`~uni4d_fg.slam.stages.bundle_adjustment.adjust_bundle`."""
 
     def initialize(
         self, labelled: LabelledTracks, intrinsics: FloatArray, *, free_intrinsics: bool
@@ -62,7 +65,7 @@ class StaticSceneSolver:
         observations = self._observations(labelled)
         return adjust_bundle(
             observations, start, prior_intrinsics, self.config.bundle_adjustment, freedom,
-            energy_of(self.config), self.hooks, self.run,
+            energy_of(self.config), self.hooks, self.run, self.find_fragments,
         )  # fmt: skip
 
     def solve(
