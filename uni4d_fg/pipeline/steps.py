@@ -105,7 +105,8 @@ def bundle_adjustment_step(
     if imu is not None:
         return _with_imu(sequence, labelled, start, freedom, config, hooks, run, imu)
     try:
-        scene = StaticSceneSolver(config, run, hooks).adjust(labelled, start, sequence.intrinsics, freedom)
+        solver = StaticSceneSolver(config, run, hooks, timestamps=sequence.timestamps)
+        scene = solver.adjust(labelled, start, sequence.intrinsics, freedom)
     except DegenerateProblemError as reason:
         if not fixed:
             raise
@@ -128,7 +129,8 @@ def _with_imu(
     first = start_with_imu(labelled, start, prior, freedom, sequence.timestamps, imu, config, hooks, run)
     stop_if_cancelled(first.solves)
     adding = adding_to(run, [first.source])
-    scene = StaticSceneSolver(config, adding, hooks).adjust(labelled, first.cameras, prior, freedom)
+    solver = StaticSceneSolver(config, adding, hooks, timestamps=sequence.timestamps)
+    scene = solver.adjust(labelled, first.cameras, prior, freedom)
     stop_if_cancelled(scene.solves)
     summary = _scene_summary(sequence, replace(scene, solves=[*first.solves, *scene.solves]), config)
     summary["imu"] = imu_summary(first, adding)

@@ -11,6 +11,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.geometry import se3
 from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.slam.stages.acceleration import AccelerationPrior
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -92,6 +93,8 @@ class StaticScene:
     solves: list[SolveSummary] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     """Number of observations or landmarks dropped, per reason."""
+    acceleration: AccelerationPrior | None = None
+    """The prior on the cameras' acceleration that they were solved with; None without one."""
 
     def state(self) -> State:
         """Return the variables of the scene."""

@@ -34,6 +34,8 @@ class StaticSceneSolver:
     """Progress and cancellation."""
     observations_per_frame: int | None = None
     """Bundle adjustment takes evenly spread tracks with about this many observations per frame; all when None."""
+    timestamps: FloatArray | None = None
+    """(T,) s, for the prior on acceleration; frame numbers when None."""
 
     def initialize(
         self, labelled: LabelledTracks, intrinsics: FloatArray, *, free_intrinsics: bool
@@ -62,7 +64,7 @@ class StaticSceneSolver:
         observations = self._observations(labelled)
         return adjust_bundle(
             observations, start, prior_intrinsics, self.config.bundle_adjustment, freedom,
-            energy_of(self.config), self.hooks, self.run,
+            energy_of(self.config), self.hooks, self.run, self.timestamps,
         )  # fmt: skip
 
     def solve(
