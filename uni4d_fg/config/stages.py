@@ -32,12 +32,9 @@ class AccelerationConfig(Section):
     linear: PositiveFloat | Literal["auto"] | None = setting(
         "auto",
         "Standard deviation of each component of the camera's acceleration, m/s^2; 'auto' estimates it from the "
-        "sequence, null switches the term off.",
-        basic=True,
+        "sequence once the noise is measured, null switches the term off.",
     )
-    angular: PositiveFloat | Literal["auto"] | None = setting(
-        "auto", "The same of its angular acceleration, rad/s^2.", basic=True
-    )
+    angular: PositiveFloat | Literal["auto"] | None = setting("auto", "The same of its angular acceleration, rad/s^2.")
 
 
 class CameraInitConfig(Section):
@@ -116,7 +113,7 @@ class BundleAdjustmentConfig(Section):
         CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0),
         "E_cam of the paper: relative change of successive relative motions.",
     )
-    acceleration: AccelerationConfig = setting(AccelerationConfig(), "E_cam of 'map'.", basic=True)
+    acceleration: AccelerationConfig = setting(AccelerationConfig(), "E_cam of 'map'.")
     max_reprojection_px: float = setting(
         8.0, "Observations above this after the first solve are dropped, px.", gt=0, basic=True
     )

@@ -150,12 +150,15 @@ def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
         "pose_covariance": scene.pose_covariance,
         "intrinsics_covariance": scene.intrinsics_covariance,
         "noise": np.array([scene.noise.reprojection_sigma_px, scene.noise.depth_sigma]),
+        **({} if scene.acceleration is None else scene.acceleration.arrays()),
     }
 
 
 def _scene_summary(sequence: Sequence, scene: StaticScene, config: Config) -> dict[str, Any]:
     solves = [solve_dict(s) for s in scene.solves]
     summary = bundle_summary(sequence, scene_arrays(scene), len(scene.observations), scene.dropped, solves)
+    if scene.acceleration is not None:
+        summary["facts"] += scene.acceleration.facts()
     summary["exact_energy"] = paper_energy(scene, config.normalization)
     return summary
 

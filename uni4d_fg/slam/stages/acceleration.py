@@ -15,9 +15,12 @@ Source: restricted maximum likelihood (Patterson and Thompson 1971); Koch 1986 f
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.solver import SolverConfig
@@ -51,6 +54,27 @@ class AccelerationPrior:
     """Standard deviation of each component, m/s^2; None without a prior."""
     angular: float | None
     """The same, rad/s^2."""
+    is_weak: tuple[str, ...] = ()
+    """Which of the two are weak and yet to be estimated."""
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return it as arrays for a file."""
+        sigma = [np.nan if s is None else s for s in (self.linear, self.angular)]
+        return {"acceleration_sigma": np.array(sigma), "acceleration_times": self.timestamps}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> AccelerationPrior | None:
+        """Return what :meth:`arrays` was made of; None where nothing is known of it."""
+        if "acceleration_sigma" not in arrays:
+            return None
+        linear, angular = (None if np.isnan(s) else float(s) for s in arrays["acceleration_sigma"])
+        return cls(arrays["acceleration_times"], linear, angular)
+
+    def facts(self) -> list[str]:
+        """Return what a summary says of it."""
+        sigmas = ((self.linear, "m/s^2", "linear"), (self.angular, "rad/s^2", "angular"))
+        known = [f"{s:.2g} {unit}" for s, unit, name in sigmas if s is not None and name not in self.is_weak]
+        return ["the camera's acceleration is taken for " + " and ".join(known)] if known else []
 
     def terms(self) -> list[FactorBatch]:
         """Return the factors over all frames."""
@@ -69,37 +93,45 @@ class AccelerationPrior:
 
 
 def starting_prior(
-    config: AccelerationConfig, timestamps: FloatArray, world_T_cam: FloatArray, landmarks: FloatArray
+    config: AccelerationConfig, timestamps: FloatArray | None, world_T_cam: FloatArray, landmarks: FloatArray
 ) -> AccelerationPrior:
     """Return the prior of the first solve: the sigmas that are given, and weak ones in place of those to estimate.
 
     Args:
         config: What is given.
-        timestamps: (T,) s.
+        timestamps: (T,) s; where they are not known, frames count as equally far apart, and no sigma as given.
         world_T_cam: (T, 4, 4) starting poses.
         landmarks: (N, 3) starting landmarks; their distance says what is a large motion.
     """
+    sigmas: dict[str, float | None] = {}
+    is_weak = []
+    known = timestamps is not None
+    if timestamps is None:
+        timestamps = np.arange(len(world_T_cam), dtype=np.float64)
     per_frame = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 1.0
     distance = float(np.median(np.linalg.norm(landmarks - world_T_cam[:, :3, 3].mean(axis=0), axis=1)))
     weak = _WEAK / per_frame**2
-    return AccelerationPrior(
-        timestamps,
-        weak * max(distance, 1e-9) if config.linear == "auto" else config.linear,
-        weak if config.angular == "auto" else config.angular,
-    )
+    for name, given, unit in (("linear", config.linear, max(distance, 1e-9)), ("angular", config.angular, 1.0)):
+        if given == "auto" or (given is not None and not known):
+            sigmas[name] = weak * unit
+            is_weak.append(name)
+        else:
+            sigmas[name] = given
+    return AccelerationPrior(timestamps, sigmas["linear"], sigmas["angular"], tuple(is_weak))
 
 
 def estimate_prior(
-    prior: AccelerationPrior, config: AccelerationConfig, problem: Problem, state: State, solver: SolverConfig
+    prior: AccelerationPrior, problem: Problem, state: State, solver: SolverConfig, overstated: float = 1.0
 ) -> AccelerationPrior:
-    """Return the prior with the sigmas that are 'auto' estimated at the end of a solve.
+    """Return the prior with some sigmas estimated at the end of a solve.
 
     Args:
         prior: Of :func:`starting_prior`, which is among the factors of ``problem``.
-        config: Which sigmas are to be estimated.
         problem: Bundle adjustment with the noise it is to be solved with.
         state: The end of the first solve.
         solver: Its options.
+        overstated: The sigmas of the observations as a multiple of the true ones. The true ones say how noisy the
+            accelerations are; against overstated ones the prior must be as much weaker.
 
     Raises:
         SolverError: If a factor is not finite.
@@ -114,15 +146,12 @@ def estimate_prior(
             if seen is not None:
                 found.setdefault(batch.factor_type, []).append(seen)
     estimated: dict[str, float] = {}
-    for name, kind, wanted in (
-        ("linear", camera_linear_acceleration, config.linear),
-        ("angular", camera_angular_acceleration, config.angular),
-    ):
-        if wanted == "auto" and kind in found:
+    for name, kind in (("linear", camera_linear_acceleration), ("angular", camera_angular_acceleration)):
+        if name in prior.is_weak and kind in found:
             y, noise = (np.concatenate(part) for part in zip(*found[kind], strict=True))
             if len(y):
-                estimated[name] = variance_component(y, noise)
-    return replace(prior, **estimated)
+                estimated[name] = overstated * variance_component(y, noise / overstated**2)
+    return replace(prior, is_weak=(), **estimated)
 
 
 def variance_component(y: FloatArray, noise: FloatArray) -> float:

@@ -205,8 +205,7 @@ def adjust_bundle(
     solves: list[SolveSummary] = []
     covariances = unknown_covariances(len(start.world_T_cam))
     rounds = 2 if energy.is_likelihood and config.measure_noise else 1
-    times = np.arange(len(start.world_T_cam), dtype=np.float64) if timestamps is None else timestamps
-    motion = starting_prior(config.acceleration, times, start.world_T_cam, landmarks)
+    motion = starting_prior(config.acceleration, timestamps, start.world_T_cam, landmarks)
 
     def declare() -> Problem:
         return bundle_adjustment_problem(
@@ -215,8 +214,8 @@ def adjust_bundle(
 
     for index in range(rounds):
         problem = declare()
-        if index == 1 and freedom.poses and "auto" in (config.acceleration.linear, config.acceleration.angular):
-            motion = estimate_prior(motion, config.acceleration, problem, state, config.solver)
+        if index == 1 and freedom.poses and motion.is_weak:
+            motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
             problem = declare()
         stage = Stage("bundle_adjustment", problem, config.solver)
         state, summary = run(stage, state, hooks)

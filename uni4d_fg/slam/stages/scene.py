@@ -63,6 +63,8 @@ class StaticNoise:
     depth_sigma: float
     depth_correlation: float = 0.0
     """How alike the log-depth errors of one track are, in [0, 1]."""
+    overstated: float = 1.0
+    """The reprojection sigma as a multiple of what was measured: above one where that lies below the floor."""
 
     def effective_depth_sigma(self, observations_per_track: float) -> float:
         """Return the sigma at which n equally correlated depths of a track carry the information they have.
