@@ -86,13 +86,13 @@ def synthetic(rates: list[float], seeds: list[int], frames: int, noise: CueNoise
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 
-def recording(folder: Path, run: Path, folds: int) -> None:
+def recording(folder: Path, run: Path, folds: int, chosen: list[str]) -> None:
     """Print held-out errors and ATE of a recording."""
     sequence, labelled = read_sequence(folder), load_labels(RunFolder(run).labels)
     cameras = camera_init_step(sequence, labelled, load_config(), Hooks()).arrays
     truth = sequence.ground_truth.world_T_cam
     print("| prior | held-out error, px | ATE, mm | RPE, degrees | seconds |\n|---|---|---|---|---|")
-    for name, settings in SETTINGS.items():
+    for name, settings in ((name, settings) for name, settings in SETTINGS.items() if name in chosen):
         config = load_config(None, settings)
         started = time.perf_counter()
         found = bundle_adjustment_step(sequence, labelled, cameras, config, Hooks())
@@ -114,12 +114,13 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--exact", action="store_true", help="synthetic scenes without noise")
+    parser.add_argument("--priors", nargs="+", default=list(SETTINGS), choices=list(SETTINGS), help="of a recording")
     arguments = parser.parse_args()
     if arguments.sequence is None:
         noise = CueNoise.none() if arguments.exact else CueNoise()
         synthetic(arguments.rates, arguments.seeds, arguments.frames, noise)
     else:
-        recording(arguments.sequence, arguments.run, arguments.folds)
+        recording(arguments.sequence, arguments.run, arguments.folds, arguments.priors)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.slam.stages.acceleration import AccelerationPrior
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom
 from uni4d_fg.slam.stages.joint import MovingCues, joint_problem, joint_state, mesh_of, solve_joint
 from uni4d_fg.slam.stages.observations import observations_of
@@ -95,7 +96,7 @@ def problem_of(data: Sample, config: Config = CONFIG, freedom: Freedom = FREE) -
 def test_it_holds_the_terms_of_both_stages_and_everything_but_the_gauge_is_free() -> None:
     data = sample()
     prior = AccelerationPrior(np.arange(FRAMES, dtype=np.float64), 1.0, 1.0)
-    problem, state = problem_of(replace(data, static=replace(data.static, acceleration=prior)))
+    problem, state = problem_of(dataclasses.replace(data, static=dataclasses.replace(data.static, acceleration=prior)))
     names = {batch.name for batch in problem.batches}
     assert names >= {"static_reprojection", "dynamic_reprojection", "depth_prior", "arap", "smoothness"}
     assert names >= {"camera_angular_acceleration", "camera_linear_acceleration"}
