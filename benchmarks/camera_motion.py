@@ -47,8 +47,6 @@ SETTINGS: dict[str, list[str]] = {
     "none": OFF,
     **{f"relative change, weight {w:g}": relative_change(w) for w in (10, 100, 500, 2000)},
     **{f"acceleration {s:g} m/s^2": fixed(s) for s in (0.1, 0.3, 1.0)},
-    "auto linear": OFF[1:],
-    "auto angular": OFF[:1],
     "acceleration auto": [],
 }
 

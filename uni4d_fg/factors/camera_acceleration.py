@@ -1,7 +1,7 @@
 r"""Acceleration of the camera over three frames, in time units.
 
-    linear    r = 2 (v2 - v1) / (h1 + h2),   v1 = (c_t - c_{t-1}) / h1,          v2 = (c_{t+1} - c_t) / h2          [m/s^2]
-    angular   r = 2 (w2 - w1) / (h1 + h2),   w1 = Log(R_{t-1}^T R_t) / h1,       w2 = Log(R_t^T R_{t+1}) / h2     [rad/s^2]
+    linear    r = 2 (v2 - v1) / (h1 + h2),   v1 = (c_t - c_{t-1}) / h1,      v2 = (c_{t+1} - c_t) / h2       [m/s^2]
+    angular   r = 2 (w2 - w1) / (h1 + h2),   w1 = Log(R_{t-1}^T R_t) / h1,   w2 = Log(R_t^T R_{t+1}) / h2  [rad/s^2]
 
 c is the camera's center in the world, w the angular velocity in the camera's axes, h1 and h2 (s) the times from frame
 t-1 to t and from t to t+1, which need not be equal. r is the second derivative to first order in h, to second order

@@ -1,9 +1,9 @@
 r"""The prior on the camera's acceleration, whose strength is a variance component of the sequence itself.
 
 The accelerations a (3 components at each inner frame) of a camera path are taken for independent and normal with one
-variance s^2, the same for the whole sequence. What a solve finds of them is y = a + e with e ~ N(0, C): C = D S D^T, S the
-covariance of the poses and D the derivative of the accelerations. In the axes in which C is diagonal, with
-eigenvalues c_i,
+variance s^2, the same for the whole sequence. What a solve finds of them is y = a + e with e ~ N(0, C):
+C = D S D^T, S the covariance of the poses and D the derivative of the accelerations. In the axes in which C is
+diagonal, with eigenvalues c_i,
 
     -2 log p(y | s) = sum_i log(s^2 + c_i) + y_i^2 / (s^2 + c_i) + const
 
@@ -16,7 +16,7 @@ Source: restricted maximum likelihood (Patterson and Thompson 1971); Koch 1986 f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -145,13 +145,13 @@ def estimate_prior(
             seen = _seen_with_noise(batch, frames, reduced, state)
             if seen is not None:
                 found.setdefault(batch.factor_type, []).append(seen)
-    estimated: dict[str, float] = {}
+    estimated: dict[str, float | None] = {"linear": prior.linear, "angular": prior.angular}
     for name, kind in (("linear", camera_linear_acceleration), ("angular", camera_angular_acceleration)):
         if name in prior.is_weak and kind in found:
             y, noise = (np.concatenate(part) for part in zip(*found[kind], strict=True))
             if len(y):
                 estimated[name] = overstated * variance_component(y, noise / overstated**2)
-    return replace(prior, is_weak=(), **estimated)
+    return AccelerationPrior(prior.timestamps, estimated["linear"], estimated["angular"])
 
 
 def variance_component(y: FloatArray, noise: FloatArray) -> float:
