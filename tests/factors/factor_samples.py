@@ -42,6 +42,8 @@ MEASURED: Mapping[str, Callable[[np.random.Generator, tuple[int, ...]], FloatArr
     "uv_target": lambda rng, shape: rng.uniform([0, 0], [640, 480], size=shape),
     "depth": lambda rng, shape: rng.uniform(1.0, 4.0, size=shape),
     "distance": lambda rng, shape: rng.uniform(1.0, 4.0, size=shape),
+    "seconds_before": lambda rng, shape: rng.uniform(0.5, 2.0, size=shape),
+    "seconds_after": lambda rng, shape: rng.uniform(0.5, 2.0, size=shape),
     "floor": lambda rng, shape: np.full(shape, 1e-3),
     "intrinsics": lambda rng, shape: rng.uniform(*PHYSICAL[INTRINSICS], size=shape),
 }

@@ -6,6 +6,7 @@ from typing import Literal
 
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.config.stages import CameraMotionConfig
 
 
 class IncrementalConfig(Section):
@@ -42,6 +43,10 @@ class IncrementalConfig(Section):
     )
     min_observations: int = setting(
         2, "Landmarks seen in fewer keyframes are not used; the depth cue holds those that are seen in few.", ge=2
+    )
+    camera_motion: CameraMotionConfig = setting(
+        CameraMotionConfig(rotation_weight=1.0, translation_weight=500.0),
+        "E_cam between keyframes that follow each other in the video.",
     )
     bridge_sigma_rad: float = setting(
         0.02, "Standard deviation of a bridged frame's rotation about constant velocity, rad per frame bridged.", gt=0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pydantic import PositiveFloat
+
 from uni4d_fg.config.base import Section, setting
 from uni4d_fg.config.rejoin import RejoinConfig
 from uni4d_fg.config.solver import KernelConfig, SolverConfig
@@ -23,6 +25,17 @@ class CameraMotionConfig(Section):
     norm_threshold: float = setting(
         3e-3, "Smoothing at zero of both norms (energy 'paper' only); the larger, the farther the minimum moves.", gt=0
     )
+
+
+class AccelerationConfig(Section):
+    """The camera's acceleration, in the time units of the timestamps (energy 'map' only)."""
+
+    linear: PositiveFloat | Literal["auto"] | None = setting(
+        "auto",
+        "Standard deviation of each component of the camera's acceleration, m/s^2; 'auto' estimates it from the "
+        "sequence once the noise is measured, null switches the term off.",
+    )
+    angular: PositiveFloat | Literal["auto"] | None = setting("auto", "The same of its angular acceleration, rad/s^2.")
 
 
 class CameraInitConfig(Section):
@@ -98,8 +111,10 @@ class BundleAdjustmentConfig(Section):
     )
     depth_scale_prior_sigma: float = setting(0.05, "Standard deviation of a frame's log-scale about zero.", gt=0)
     camera_motion: CameraMotionConfig = setting(
-        CameraMotionConfig(rotation_weight=1.0, translation_weight=500.0), "E_cam.", basic=True
+        CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0),
+        "E_cam of the paper: relative change of successive relative motions.",
     )
+    acceleration: AccelerationConfig = setting(AccelerationConfig(), "E_cam of 'map'.")
     max_reprojection_px: float = setting(
         8.0, "Observations above this after the first solve are dropped, px.", gt=0, basic=True
     )

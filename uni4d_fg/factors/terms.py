@@ -1,6 +1,7 @@
 """Every factor type of the package: importing this module declares them all."""
 
 from uni4d_fg.factors.arap import arap
+from uni4d_fg.factors.camera_acceleration import camera_angular_acceleration, camera_linear_acceleration
 from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
 from uni4d_fg.factors.camera_priors import fisheye_camera_prior, opencv_camera_prior
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, joint_dynamic_depth_prior, static_depth_prior
@@ -16,6 +17,8 @@ __all__ = [
     "acceleration_smoothness",
     "arap",
     "aspect_prior",
+    "camera_angular_acceleration",
+    "camera_linear_acceleration",
     "camera_rotation",
     "camera_translation",
     "depth_reprojection",

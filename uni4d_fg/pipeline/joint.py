@@ -18,6 +18,7 @@ from uni4d_fg.pipeline.steps import correct_cue, frozen_cameras, scene_arrays, s
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.slam.reconstruction import OBJECT_ARRAYS
+from uni4d_fg.slam.stages.acceleration import AccelerationPrior
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom
 from uni4d_fg.slam.stages.energy import energy_of
 from uni4d_fg.slam.stages.joint import MovingCues, solve_joint
@@ -88,6 +89,7 @@ def static_scene(labelled: LabelledTracks, scene: Arrays, config: Config) -> Sta
     return StaticScene(
         cameras, scene["landmarks"], scene["landmark_track"], observations, noise, scene["landmark_error"],
         scene.get("pose_covariance", unknown[0]), scene.get("intrinsics_covariance", unknown[1]),
+        acceleration=AccelerationPrior.of_arrays(scene),
     )  # fmt: skip
 
 

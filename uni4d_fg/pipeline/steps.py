@@ -108,7 +108,7 @@ def bundle_adjustment_step(
     if imu is not None:
         return _with_imu(sequence, labelled, start, freedom, config, hooks, run, imu, find_fragments)
     try:
-        solver = StaticSceneSolver(config, run, hooks, find_fragments=find_fragments)
+        solver = StaticSceneSolver(config, run, hooks, find_fragments=find_fragments, timestamps=sequence.timestamps)
         scene = solver.adjust(labelled, start, sequence.intrinsics, freedom)
     except DegenerateProblemError as reason:
         if not fixed:
@@ -133,7 +133,7 @@ def _with_imu(
     first = start_with_imu(labelled, start, prior, freedom, sequence.timestamps, imu, config, hooks, run)
     stop_if_cancelled(first.solves)
     adding = adding_to(run, [first.source])
-    solver = StaticSceneSolver(config, adding, hooks, find_fragments=find_fragments)
+    solver = StaticSceneSolver(config, adding, hooks, find_fragments=find_fragments, timestamps=sequence.timestamps)
     scene = solver.adjust(labelled, first.cameras, prior, freedom)
     stop_if_cancelled(scene.solves)
     summary = _scene_summary(sequence, replace(scene, solves=[*first.solves, *scene.solves]), config)
@@ -154,6 +154,7 @@ def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
         "pose_covariance": scene.pose_covariance,
         "intrinsics_covariance": scene.intrinsics_covariance,
         "noise": np.array([scene.noise.reprojection_sigma_px, scene.noise.depth_sigma]),
+        **({} if scene.acceleration is None else scene.acceleration.arrays()),
     }
 
 
@@ -163,6 +164,8 @@ def _scene_summary(sequence: Sequence, scene: StaticScene, config: Config) -> di
     if scene.joined:
         summary["joined_tracks"] = scene.joined
         summary["facts"].append(f"{scene.joined} tracks joined to earlier ones of the same point")
+    if scene.acceleration is not None:
+        summary["facts"] += scene.acceleration.facts()
     summary["exact_energy"] = paper_energy(scene, config.normalization)
     return summary
 

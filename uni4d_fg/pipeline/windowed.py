@@ -97,8 +97,9 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
 
         def compute(window: Window = window) -> StageRecord:
             scene, done, lost = solve_scene(
-                tracks_in(labelled, window.frames), window, intrinsics, intrinsics, initial, config, hooks, windowed.run
-            )
+                tracks_in(labelled, window.frames), window, intrinsics, intrinsics, initial, config, hooks,
+                windowed.run, timestamps=windowed.sequence.timestamps,
+            )  # fmt: skip
             _stop_if_cancelled(done)
             return StageRecord(scene.arrays(), {"solves": [solve_dict(s) for s in done], "dropped": lost})
 

@@ -98,8 +98,8 @@ def test_what_leaves_the_window_is_what_a_batch_of_everything_knows() -> None:
     count = 14
     sensors = Sensors(count)
     config = stream_config(
-        "incremental.window=4", "input.intrinsics=fixed", "bundle_adjustment.camera_motion.rotation_weight=0",
-        "bundle_adjustment.camera_motion.translation_weight=0",
+        "incremental.window=4", "input.intrinsics=fixed", "incremental.camera_motion.rotation_weight=0",
+        "incremental.camera_motion.translation_weight=0",
     )  # fmt: skip
     incremental = config.incremental.model_copy(update={"solver": EXACT})
     config = config.model_copy(update={"incremental": incremental})

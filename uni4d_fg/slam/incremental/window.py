@@ -300,7 +300,7 @@ class CameraWindow:
         chosen = consecutive & (self.bridged[first] + self.bridged[first + 1] + self.bridged[first + 2] == 0)
         if not chosen.any():
             return []
-        terms = camera_motion_terms(np.arange(len(self)), self.config.bundle_adjustment.camera_motion, MAP)
+        terms = camera_motion_terms(np.arange(len(self)), self.config.incremental.camera_motion, MAP)
         return [batch.take(np.flatnonzero(chosen)) for batch in terms]
 
     def _bridge_terms(self) -> list[FactorBatch]:

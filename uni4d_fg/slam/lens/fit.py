@@ -190,7 +190,7 @@ class LensFit:
         state = State({variable: camera, **arrays}, pinhole.index)
         others = bundle_adjustment_problem(
             pinhole, seen, scene.noise, ba, self.prior_intrinsics[None],
-            Freedom(poses=True, intrinsics=False),
+            Freedom(poses=True, intrinsics=False), acceleration=scene.acceleration,
         )  # fmt: skip
         problem = Problem.over(state).eliminate(LANDMARK).fix(POSE, rows=[0])
         problem.add(batch for batch in others.batches if all(s.variable is not INTRINSICS for s in batch.slots))

@@ -16,6 +16,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.imu import ImuConfig
+from uni4d_fg.factors.camera_acceleration import camera_angular_acceleration, camera_linear_acceleration
 from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
 from uni4d_fg.factors.priors import gravity_magnitude, scale_anchor
 from uni4d_fg.factors.state import State
@@ -55,7 +56,9 @@ class ImuSource:
             IMU_BIAS: np.tile(self.start.bias, (len(self.start.velocity), 1)),
             GRAVITY: self.start.gravity[None],
         }
-        replaced = [scale_anchor, camera_rotation, camera_translation]
+        replaced = [
+            scale_anchor, camera_rotation, camera_translation, camera_angular_acceleration, camera_linear_acceleration,
+        ]  # fmt: skip
         return Addition(self._inertial_factors(), variables, replaces=replaced)
 
     def _inertial_factors(self) -> list[Any]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
-from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
+from uni4d_fg.config.stages import AccelerationConfig, BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.depth_prior import static_depth_prior
@@ -27,6 +27,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.stages.acceleration import AccelerationPrior, estimate_prior, starting_prior
 from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
 from uni4d_fg.slam.stages.lifting import lift, mean_per_row
 from uni4d_fg.slam.stages.merging import FindFragments, MergedTracks, merge_tracks
@@ -48,7 +49,8 @@ class Freedom:
 def without_camera_motion(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:
     """Return stage 2 without E_cam, which is made for consecutive frames."""
     still = CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0)
-    return config.model_copy(update={"camera_motion": still})
+    free = AccelerationConfig(linear=None, angular=None)
+    return config.model_copy(update={"camera_motion": still, "acceleration": free})
 
 
 def bundle_adjustment_problem(
@@ -60,6 +62,7 @@ def bundle_adjustment_problem(
     freedom: Freedom,
     energy: Energy = MAP,
     camera_motion: Sequence[FactorBatch] | None = None,
+    acceleration: AccelerationPrior | None = None,
 ) -> Problem:
     """Put bundle adjustment together.
 
@@ -72,6 +75,7 @@ def bundle_adjustment_problem(
         freedom: What is free besides landmarks and log-scales.
         energy: Weighs the terms.
         camera_motion: E_cam, where frames do not follow each other; over all frames when None.
+        acceleration: Prior on the cameras' acceleration; none when None.
     """
     num_frames = len(state[POSE])
     _, row = observations.rows()
@@ -80,6 +84,8 @@ def bundle_adjustment_problem(
     if camera_motion is None:
         camera_motion = camera_motion_terms(np.arange(num_frames), config.camera_motion, energy)
     problem.add(camera_motion)
+    if acceleration is not None and energy.is_likelihood:
+        problem.add(acceleration.terms())
     problem.fix(POSE, rows=[0] if freedom.poses else None)
     if not freedom.intrinsics:
         problem.fix(INTRINSICS)
@@ -170,6 +176,7 @@ def adjust_bundle(
     hooks: Hooks | None = None,
     run: StageRunner = run_stage,
     find_fragments: FindFragments | None = None,
+    timestamps: FloatArray | None = None,
 ) -> StaticScene:
     """Run stage 2 from the poses and intrinsics of stage 1.
 
@@ -183,6 +190,7 @@ def adjust_bundle(
         hooks: Progress and cancellation.
         run: What solves each declared stage.
         find_fragments: Finds tracks that are one point, before the second solve; None leaves every track its own.
+        timestamps: (T,) s, for the prior on acceleration; frame numbers when None.
 
     Raises:
         DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
@@ -201,8 +209,18 @@ def adjust_bundle(
     merged: MergedTracks | None = None
     covariances = unknown_covariances(len(start.world_T_cam))
     rounds = 2 if energy.is_likelihood and config.measure_noise else 1
+    motion = starting_prior(config.acceleration, timestamps, start.world_T_cam, landmarks)
+
+    def declare() -> Problem:
+        return bundle_adjustment_problem(
+            state, observations, noise, config, prior_intrinsics[None], freedom, energy, acceleration=motion
+        )
+
     for index in range(rounds):
-        problem = bundle_adjustment_problem(state, observations, noise, config, prior_intrinsics[None], freedom, energy)
+        problem = declare()
+        if index == 1 and freedom.poses and motion.is_weak:
+            motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
+            problem = declare()
         stage = Stage("bundle_adjustment", problem, config.solver)
         state, summary = run(stage, state, hooks)
         solves.append(summary)
@@ -239,7 +257,7 @@ def adjust_bundle(
     observations = observations.select(np.isin(observations.track, track[keep]))
     scene = StaticScene(
         Cameras.of(state), state[LANDMARK][keep], track[keep], observations, noise, error,
-        *covariances, solves, dropped,
+        *covariances, solves, dropped, acceleration=motion if energy.is_likelihood else None,
     )  # fmt: skip
     return scene if merged is None else merged.split(scene)
 

@@ -88,8 +88,9 @@ def joint_problem(
     """
     energy = energy_of(config)
     problem = bundle_adjustment_problem(
-        state, scene.observations, scene.noise, config.bundle_adjustment, prior_intrinsics, freedom, energy
-    )
+        state, scene.observations, scene.noise, config.bundle_adjustment, prior_intrinsics, freedom, energy,
+        acceleration=scene.acceleration,
+    )  # fmt: skip
     problem.fix(LOG_SCALE)
     problem.add(_observed_terms(mesh, moving, len(state[POSE]), config, energy))
     return problem.add(motion_terms(mesh, config.nonrigid, energy))

@@ -11,6 +11,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.geometry import se3
 from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.slam.stages.acceleration import AccelerationPrior
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -62,6 +63,8 @@ class StaticNoise:
     depth_sigma: float
     depth_correlation: float = 0.0
     """How alike the log-depth errors of one track are, in [0, 1]."""
+    overstated: float = 1.0
+    """The reprojection sigma as a multiple of what was measured: above one where that lies below the floor."""
 
     def effective_depth_sigma(self, observations_per_track: float) -> float:
         """Return the sigma at which n equally correlated depths of a track carry the information they have.
@@ -94,6 +97,8 @@ class StaticScene:
     """Number of observations or landmarks dropped, per reason."""
     joined: int = 0
     """Number of tracks that were solved as part of another one's landmark; they have its position."""
+    acceleration: AccelerationPrior | None = None
+    """The prior on the cameras' acceleration that they were solved with; None without one."""
 
     def state(self) -> State:
         """Return the variables of the scene."""

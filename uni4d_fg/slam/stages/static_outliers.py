@@ -74,10 +74,13 @@ def measure_noise(
         pose[known], landmark[known], state[LOG_SCALE][observations.frame[known]], depth=observations.depth[known]
     )
     pixel, relative = robust_sigma(reprojection), robust_sigma(depth)
+    wanted = pixel * config.reprojection_sigma_factor
+    sigma = max(wanted, config.min_reprojection_sigma_px)
     return StaticNoise(
-        max(pixel * config.reprojection_sigma_factor, config.min_reprojection_sigma_px),
+        sigma,
         max(relative, config.min_depth_sigma) if np.isfinite(relative) else noise.depth_sigma,
         intraclass_correlation(depth[:, 0], row[known]) if np.isfinite(relative) else noise.depth_correlation,
+        sigma / max(wanted, 1e-6 * sigma),
     )
 
 

@@ -37,6 +37,8 @@ class StaticSceneSolver:
     """Bundle adjustment takes evenly spread tracks with about this many observations per frame; all when None."""
     find_fragments: FindFragments | None = None
     """Joins tracks that are one point, see :func:`~uni4d_fg.slam.stages.bundle_adjustment.adjust_bundle`."""
+    timestamps: FloatArray | None = None
+    """(T,) s, for the prior on acceleration; frame numbers when None."""
 
     def initialize(
         self, labelled: LabelledTracks, intrinsics: FloatArray, *, free_intrinsics: bool
@@ -65,7 +67,7 @@ class StaticSceneSolver:
         observations = self._observations(labelled)
         return adjust_bundle(
             observations, start, prior_intrinsics, self.config.bundle_adjustment, freedom,
-            energy_of(self.config), self.hooks, self.run, self.find_fragments,
+            energy_of(self.config), self.hooks, self.run, self.find_fragments, self.timestamps,
         )  # fmt: skip
 
     def solve(

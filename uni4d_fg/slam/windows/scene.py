@@ -26,6 +26,7 @@ from uni4d_fg.optim.marginals import reduced_hessian
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.slam.stages.acceleration import AccelerationPrior
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
@@ -66,6 +67,8 @@ class WindowScene:
     observations: Observations
     """Of these landmarks; ``track`` is the landmark's row, ``frame`` counts from the window's first."""
     noise: StaticNoise
+    acceleration: AccelerationPrior | None = None
+    """On its frames."""
 
     def state(self) -> State:
         """Return it as the variables of a solve."""
@@ -79,6 +82,7 @@ class WindowScene:
             "landmark": self.landmark, "track": self.track, "row": seen.track, "frame": seen.frame, "uv": seen.uv,
             "depth": seen.depth, "weight": seen.weight,
             "noise": np.array([noise.reprojection_sigma_px, noise.depth_sigma, noise.depth_correlation]),
+            **({} if self.acceleration is None else self.acceleration.arrays()),
         }  # fmt: skip
 
     @classmethod
@@ -91,6 +95,7 @@ class WindowScene:
             arrays["track"],
             Observations(arrays["row"], arrays["frame"], arrays["uv"], arrays["depth"], arrays["weight"]),
             StaticNoise(*arrays["noise"].tolist()),
+            AccelerationPrior.of_arrays(arrays),
         )
 
 
@@ -125,6 +130,7 @@ def solve_scene(
     *,
     free_intrinsics: bool = False,
     frames: IntArray | None = None,
+    timestamps: FloatArray | None = None,
 ) -> tuple[WindowScene, list[SolveSummary], dict[str, int]]:
     """Run stages 1 and 2 on a window.
 
@@ -139,6 +145,7 @@ def solve_scene(
         run: What solves each declared stage.
         free_intrinsics: Whether the intrinsics move.
         frames: (F,) numbers of its frames in the video, where they do not follow each other.
+        timestamps: (T,) s of the whole video, for the prior on acceleration; frame numbers when None.
 
     Returns:
         The scene, the solves, and how much was dropped, per reason.
@@ -150,7 +157,9 @@ def solve_scene(
     # Landmarks and covariances are those of the joined cameras, later.
     settings = config.bundle_adjustment.model_copy(update={"structure": "keep", "covariance_cells": 0})
     run = NumberedRunner(run, window.frames if frames is None else frames, tracks.track)
-    solver = StaticSceneSolver(config.model_copy(update={"bundle_adjustment": settings}), run, hooks)
+    times = None if timestamps is None else timestamps[window.start : window.stop]
+    settings_of_window = config.model_copy(update={"bundle_adjustment": settings})
+    solver = StaticSceneSolver(settings_of_window, run, hooks, timestamps=times)
     given = None
     if initial_world_T_cam is not None:
         start = np.linalg.inv(initial_world_T_cam[window.start])
@@ -170,6 +179,7 @@ def solve_scene(
         tracks.track[found.landmark_track],
         replace(seen, track=np.searchsorted(found.landmark_track, seen.track)),
         found.noise,
+        found.acceleration,
     )
     return scene, found.solves, found.dropped
 
@@ -268,8 +278,9 @@ def information(
     free_intrinsics = config.input.intrinsics == "free"
     state, count = scene.state(), len(scene.window)
     problem = bundle_adjustment_problem(
-        state, scene.observations, scene.noise, ba, given[None], Freedom(poses=True, intrinsics=free_intrinsics)
-    )
+        state, scene.observations, scene.noise, ba, given[None], Freedom(poses=True, intrinsics=free_intrinsics),
+        acceleration=scene.acceleration,
+    )  # fmt: skip
     batches = tuple(_owned_factors(batch, middle_frames(windows, index)) for batch in problem.batches)
     batches = tuple(
         batch for batch in batches if len(batch) and (log_scale_priors or batch.factor_type is not log_scale_prior)
