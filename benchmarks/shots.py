@@ -3,8 +3,8 @@
     UNI4D_FG_DATA=/path/to/sequences python benchmarks/shots.py [--clips 40] [--seed 0] [--show]
 
 Each clip joins two to four parts of kitchen, kitchen_dog, lady_running and synthetic scenes (upright, mirrored or upside
-down, so that neighbors never show the same place), by hard cuts or dissolves of 4 to 24 frames. Within the parts there are
-traps: flashes of one to three frames, changes of exposure, whip pans (a crop that is swept over the image, or a camera
+down, so that neighbors never show the same place), by hard cuts or dissolves of 4 to 24 frames. In the middle of the parts,
+outside the dissolves, there are traps: flashes of one to three frames, changes of exposure, whip pans (a crop that is swept over the image, or a camera
 that is turned in the synthetic room, both with motion blur). A hard cut counts as found at its frame exactly, a dissolve
 where the cut lies within its frames. Without UNI4D_FG_DATA the parts are synthetic alone.
 """
@@ -108,23 +108,25 @@ def sources(root: Path | None) -> dict[str, ImageArray]:
 
 def part(frames: ImageArray, name: str, rng: np.random.Generator) -> ImageArray:
     """Return a part of a source with traps in it, (N, HEIGHT, WIDTH, 3)."""
-    count = int(rng.integers(16, 41))
+    count = int(rng.integers(18, 41))
     if name.endswith("whip"):
         begin, count = 0, len(frames)
     else:
         begin = int(rng.integers(0, max(1, len(frames) - count)))
     frames = frames[begin : begin + count]
+    pans = name.endswith("whip")
     if frames.shape[2] > WIDTH:
-        frames = swept(frames, rng) if rng.random() < 0.4 else np.stack([fitted(frame) for frame in frames])
+        pans = rng.random() < 0.4
+        frames = swept(frames, rng) if pans else np.stack([fitted(frame) for frame in frames])
     frames = exposed(frames, rng) if rng.random() < 0.35 else frames
-    return flashed(frames, rng) if rng.random() < 0.5 else frames
+    return frames if pans or rng.random() < 0.4 else flashed(frames, rng)
 
 
 def swept(frames: ImageArray, rng: np.random.Generator) -> ImageArray:
     """Return a crop that rests at one side and is swept to the other within 3 to 5 frames, with motion blur."""
     count, tall, wide = frames.shape[:3]
     steps = int(rng.integers(3, 6))
-    begin = int(rng.integers(5, count - steps - 5))
+    begin = int(rng.integers(count // 3, max(2 * count // 3 - steps, count // 3) + 1))
     room_x, room_y = wide - WIDTH, tall - HEIGHT
     y = int(rng.integers(0, room_y + 1))
     left = rng.random() < 0.5
@@ -141,7 +143,7 @@ def swept(frames: ImageArray, rng: np.random.Generator) -> ImageArray:
 
 def exposed(frames: ImageArray, rng: np.random.Generator) -> ImageArray:
     """Return frames whose exposure changes, at once or over ten frames."""
-    at, length = rng.integers(4, len(frames) - 4), rng.choice([1, 10])
+    at, length = rng.integers(len(frames) // 3, 2 * len(frames) // 3), rng.choice([1, 10])
     gain = np.exp(np.clip((np.arange(len(frames)) - at) / length, 0, 1) * rng.choice([-0.8, 0.6]))
     return np.clip(frames * gain[:, None, None, None], 0, 255).astype(np.uint8)
 
@@ -150,7 +152,8 @@ def flashed(frames: ImageArray, rng: np.random.Generator) -> ImageArray:
     """Return frames with flashes, of which some saturate the image."""
     out = frames.astype(np.float64)
     for _ in range(int(rng.integers(1, 3))):
-        at, length = int(rng.integers(3, len(frames) - 6)), int(rng.integers(1, 4))
+        length = int(rng.integers(1, 4))
+        at = int(rng.integers(len(frames) // 3, 2 * len(frames) // 3 - length + 1))
         out[at : at + length] = out[at : at + length] * rng.uniform(1.2, 2.5) + rng.uniform(60, 220)
     return np.clip(out, 0, 255).astype(np.uint8)
 
@@ -184,7 +187,6 @@ def make_clip(found: dict[str, ImageArray], seed: int) -> tuple[ImageArray, list
         names.append(f"{name}{('', '|', '-')[turn]}")
         looks.append(look)
         parts.append(part(frames, name, rng))
-    # A flash or a pan within a dissolve is no test of anything.
     lengths = [int(rng.choice([0, 0, 4, 8, 12, 16, 24])) for _ in parts[1:]]
     room = [min(len(a), len(b)) // 3 for a, b in zip(parts, parts[1:], strict=False)]
     lengths = [min(length, most) for length, most in zip(lengths, room, strict=True)]

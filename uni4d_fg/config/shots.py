@@ -29,9 +29,12 @@ class ShotsConfig(Section):
     )
     look_around: int = setting(4, "Frames before and after a suspected cut; a flash lasts no longer.", ge=1, le=30)
     dissolve_spans: tuple[int, ...] = setting((10, 18, 28), "Frames across which dissolves are looked for.")
-    max_dissolve_link: float = setting(
-        0.12, "Part of the corners that outlives a dissolve, at most, beyond chance.", gt=0, lt=1
+    max_surviving: float = setting(
+        0.12, "Part of the corners that outlives the shortest span across a dissolve, at most.", gt=0, lt=1
     )
-    min_blend: float = setting(
-        0.8, "Part of the variance of the frames in between that a blend of both sides explains.", gt=0, lt=1
+    min_lasting_similarity: float = setting(
+        0.6, "Correlation of a patch with what it was at the beginning of such a span.", gt=0, lt=1
+    )
+    max_motion: float = setting(
+        0.1, "Motion from frame to frame, part of the image, within which dissolves are looked for.", gt=0, lt=1
     )

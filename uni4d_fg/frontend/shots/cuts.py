@@ -20,6 +20,7 @@ from uni4d_fg.config.shots import ShotsConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.shots.links import SmallFrame, link, pan_between, small_frame
+from uni4d_fg.frontend.shots.survival import Span, spans
 
 _REST = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _BLUR_PX = 2.0
@@ -69,7 +70,10 @@ def find_cuts(
 @dataclass(frozen=True)
 class _Dissolve:
     cut: Cut
-    quality: float
+    is_whole: bool
+    """Both ends of the span are beyond it."""
+    rank: tuple[float, float]
+    """The lowest is believed: the steepest change, in the middle of its span."""
 
 
 class _Search:
@@ -78,14 +82,20 @@ class _Search:
         self.motion: list[FloatArray] = [_REST]
         """From the frame before."""
         self.broken: list[bool] = [False]
+        self.followed: list[bool] = [False]
+        """Whether corners were found again in it: not in the blur of a pan."""
+        self.gaps: list[Span] = []
+        """Where corners could not be followed, nor be found again soon."""
 
     def run(self) -> tuple[Cut, ...]:
         for t in range(1, len(self.frames)):
             connected, motion = self.connected(t - 1, t)
             self.broken.append(not connected)
+            self.followed.append(connected and self.has_corners(t - 1, t, motion))
             self.motion.append(motion if connected else _REST)
         hard = merged(self.hard_cuts(), self.config.look_around)
-        soft = [d.cut for d in self.dissolves()]
+        sharp = [cut for cut in hard if self.is_sharp(cut)]
+        soft = [d for d in self.dissolves() if all(cut.start < d.stop or d.start < cut.stop for cut in sharp)]
         # A short dissolve is found both ways, and its extent by the second.
         alone = [c for c in hard if not any(d.stop - 2 <= c.start and c.stop <= d.start + 2 for d in soft)]
         return tuple(merged(sorted([*alone, *soft]), self.config.look_around))
@@ -101,6 +111,10 @@ class _Search:
             return True, best.source_T_target
         similarity, shift = pan_between(one, other, config.min_overlap)
         return similarity >= config.pan_similarity, shift
+
+    def has_corners(self, a: int, b: int, motion: FloatArray) -> bool:
+        """Tell whether corners of one frame are found in the other, with what is known of the motion."""
+        return link(self.frames[a], self.frames[b], motion, self.config).found >= self.config.max_broken
 
     def hard_cuts(self) -> list[Cut]:
         shows = [frame.shows_something for frame in self.frames]
@@ -121,43 +135,87 @@ class _Search:
                 return True
         return False
 
-    def dissolves(self) -> list[_Dissolve]:
-        found: list[_Dissolve] = []
-        for span in self.config.dissolve_spans:
-            for a in range(0, len(self.frames) - span, max(1, span // 4)):
-                candidate = self.dissolve(a, a + span)
-                if candidate is not None:
-                    found.append(candidate)
-        kept: list[_Dissolve] = []
-        for candidate in sorted(found, key=lambda d: (-d.quality, d.cut)):
-            if all(candidate.cut.start <= k.cut.stop or k.cut.start <= candidate.cut.stop for k in kept):
-                kept.append(candidate)
-        return sorted(kept, key=lambda d: d.cut)
+    def is_sharp(self, cut: Cut) -> bool:
+        """Tell whether the frames up to a cut show nothing of what is behind it, and the other way round."""
+        a, b = cut.stop - 3, cut.start + 2
+        if cut.stop != cut.start or a < 0 or b >= len(self.frames):
+            return False
+        shares, _ = self.blend(a, b)
+        return bool(shares[:2].max() < 0.25 and shares[2:].min() > 0.75)
 
-    def dissolve(self, a: int, b: int) -> _Dissolve | None:
-        """Return the dissolve that lies between two frames, if there is one."""
-        one, other = self.frames[a], self.frames[b]
-        if not (one.shows_something and other.shows_something):
-            return None
-        for guess in (_REST, self.accumulated(a, b)):
-            across = link(one, other, guess, self.config)
-            if across.overlap < self.config.min_overlap or across.found > self.config.max_dissolve_link:
-                return None
-        if pan_between(one, other, self.config.min_overlap)[0] >= self.config.pan_similarity:
+    def dissolves(self) -> list[Cut]:
+        found: list[_Dissolve] = []
+        shortest = min(self.config.dissolve_spans)
+        followed = list(spans(self.frames, self.steps(), self.config))
+        for span in [*followed, *self.gaps]:
+            # The longer the span, the fewer corners outlive it in a video without any cut.
+            limit = self.config.max_surviving * shortest / (span.last - span.first)
+            candidate = self.dissolve(span) if span.alive <= limit else None
+            if candidate is not None:
+                found.append(candidate)
+        kept: list[Cut] = []
+        for candidate in sorted(found, key=lambda d: d.rank):
+            if all(candidate.cut.start <= cut.stop or cut.start <= candidate.cut.stop for cut in kept):
+                kept.append(candidate.cut)
+        return sorted(self.extended(cut, kept, found) for cut in kept)
+
+    @staticmethod
+    def extended(cut: Cut, kept: list[Cut], found: list[_Dissolve]) -> Cut:
+        """Return a dissolve as the spans saw it that hold the whole of it, and no other."""
+        wider = [
+            d.cut
+            for d in found
+            if d.is_whole
+            and d.cut.stop <= cut.frame <= d.cut.start
+            and d.cut.start - d.cut.stop <= 3 * (cut.start - cut.stop)
+            and all(other == cut or other.start <= d.cut.stop or d.cut.start <= other.stop for other in kept)
+        ]
+        return min(wider, key=lambda c: c.start - c.stop, default=cut)
+
+    def steps(self) -> list[int | None]:
+        """Return from where corners are followed to each frame, as :func:`spans` takes it."""
+        steps: list[int | None] = [None]
+        last = 0
+        limit = self.config.max_motion * max(self.frames[0].size)
+        for t in range(1, len(self.frames)):
+            if last == t - 1 and not self.broken[t]:
+                fast = float(np.hypot(*self.motion[t][:, 2])) > limit
+                steps.append(None if fast or not self.followed[t] else last)
+                last = t
+            elif last < t - 1 and self.connected(last, t)[0]:
+                steps.append(last)
+                last = t
+            elif t - last <= self.config.look_around:
+                steps.append(t)
+            else:
+                self.gaps.append(Span(max(0, last - 3), min(t + 3, len(self.frames) - 1), 0.0))
+                steps.append(None)
+                last = t
+        return steps
+
+    def dissolve(self, span: Span) -> _Dissolve | None:
+        """Return the dissolve that lies between two frames, if what is between them looks like one."""
+        a, b = span.first, span.last
+        if self.connected(a, b)[0]:
             return None
         shares, explained = self.blend(a, b)
-        mixed = (shares > 0.15) & (shares < 0.85)
-        if mixed.sum() < 2 or explained[mixed].mean() < self.config.min_blend:
-            return None
-        if np.corrcoef(shares, np.arange(len(shares)))[0, 1] < 0.8 or shares[0] > 0.3 or shares[-1] < 0.7:
+        # A flash within is neither side.
+        shares = cv2.medianBlur(shares.astype(np.float32)[None], 5)[0].astype(np.float64)
+        numbers = np.arange(a + 1, b)
+        mixed = (shares > 0.1) & (shares < 0.9)
+        if shares[0] > 0.4 or shares[-1] < 0.6 or mixed.sum() < 2:
             return None
         # The ends are blends as well where the dissolve is longer than the span: its rate tells how far it goes.
-        rate, offset = np.polyfit(np.flatnonzero(mixed) + a + 1.0, shares[mixed], 1)
+        rate, offset = np.polyfit(numbers[mixed], shares[mixed], 1)
         if rate <= 0.0:
             return None
         stop = int(np.clip(np.ceil((_PURE - offset) / rate), a + 1, b))
         start = int(np.clip(np.floor((1.0 - _PURE - offset) / rate) + 1, stop, b))
-        return _Dissolve(Cut(stop, start), float(explained.mean()))
+        if stop == a + 1 and start >= b - 1:
+            return None  # ordinary motion fades from one end of a span to the other like this
+        is_whole = bool(shares[1] < 0.1 and shares[-2] > 0.9 and stop > a + 1 and start < b)
+        off_center = abs(stop + start - a - b) / (b - a)
+        return _Dissolve(Cut(stop, start), is_whole, ((start - stop) * (1.0 if is_whole else 1.5), off_center))
 
     def accumulated(self, a: int, b: int) -> FloatArray:
         """Return the (2, 3) motion of pixels from one frame to a later one, step by step."""

@@ -84,8 +84,8 @@ def link(source: SmallFrame, target: SmallFrame, guess: FloatArray, config: Shot
     if inside.sum() < config.min_corners or not (source.shows_something and target.shows_something):
         return Link(0.0, guess, overlap)
     points, start = points[inside], start[inside]
-    moved, status = _flow(source.local, target.local, points, start)
-    back, status_back = _flow(target.local, source.local, moved, (points + (moved - start)).astype(np.float32))
+    moved, status = flow(source.local, target.local, points, start)
+    back, status_back = flow(target.local, source.local, moved, (points + (moved - start)).astype(np.float32))
     kept = status & status_back & _inside(moved, target.size)
     kept &= np.linalg.norm(back - points, axis=1) <= config.forward_backward_px
     kept[kept] = similarity(source.local, target.local, points[kept], moved[kept], config.patch_px) >= (
@@ -192,9 +192,13 @@ def _patches(image: ImageArray, points: Float32Array, patch_px: int) -> FloatArr
     return values
 
 
-def _flow(
+def flow(
     source: ImageArray, target: ImageArray, points: Float32Array, start: Float32Array
 ) -> tuple[Float32Array, BoolArray]:
+    """Return where points (N, 2) px of one image are in another, and whether (N,) they were found.
+
+    The search begins at ``start`` (N, 2) px.
+    """
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         source, target, np.ascontiguousarray(points), start.copy(), winSize=_WINDOW, maxLevel=_LEVELS,
         criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
