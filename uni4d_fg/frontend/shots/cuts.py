@@ -154,8 +154,10 @@ class _Search:
             if candidate is not None:
                 found.append(candidate)
         kept: list[Cut] = []
+        apart = self.config.look_around
         for candidate in sorted(found, key=lambda d: d.rank):
-            if all(candidate.cut.start <= cut.stop or cut.start <= candidate.cut.stop for cut in kept):
+            first, last = candidate.cut.stop - apart, candidate.cut.start + apart
+            if all(last <= cut.stop or cut.start <= first for cut in kept):
                 kept.append(candidate.cut)
         return sorted(self.extended(cut, kept, found) for cut in kept)
 
