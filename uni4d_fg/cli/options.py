@@ -64,6 +64,9 @@ TrackModel = Annotated[
 IntrinsicsFile = Annotated[
     str | None, typer.Option("--intrinsics", help="Calibration: .npy of a (3, 3) matrix, px.", show_default=False)
 ]
+OneShot = Annotated[
+    bool, typer.Option("--one-shot", help="Solve the video as one shot, whatever cuts are found; they are named.")
+]
 Imu = Annotated[
     Path | None,
     typer.Option(

@@ -13,6 +13,7 @@ class ShotsConfig(Section):
     split: Literal["auto", "off"] = setting(
         "auto", "'auto' looks for cuts and reconstructs each shot on its own; 'off' does not look.", basic=True
     )
+    min_frames: int = setting(6, "Shots with fewer frames are left out, with a warning.", ge=2, basic=True)
     width: int = setting(160, "Longer side of the images in which cuts are looked for, px.", ge=64, le=640)
     max_corners: int = setting(90, "Corners of a frame that are looked for in another, at most.", ge=20)
     min_corners: int = setting(12, "A frame with fewer corners shows nothing: black, white or out of focus.", ge=4)
