@@ -3,9 +3,10 @@
     UNI4D_FG_DATA=/path/to/sequences python benchmarks/shots.py [--clips 40] [--seed 0] [--show]
 
 Each clip joins two to four parts of kitchen, kitchen_dog, lady_running and synthetic scenes (upright, mirrored or upside
-down, so that neighbors never show the same place), by hard cuts or dissolves of 4 to 24 frames. In the middle of the parts,
-outside the dissolves, there are traps: flashes of one to three frames, changes of exposure, whip pans (a crop that is swept over the image, or a camera
-that is turned in the synthetic room, both with motion blur). A hard cut counts as found at its frame exactly, a dissolve
+down, so that neighbors never show the same place), by hard cuts or dissolves of 4 to 24 frames. In the middle of the
+parts, outside the dissolves, there are traps: flashes of one to three frames, changes of exposure, whip pans (a crop that
+is swept over the image, or a camera that is turned in the synthetic room, both with motion blur; no flash with a whip
+pan). A hard cut counts as found at its frame exactly, a dissolve
 where the cut lies within its frames. Without UNI4D_FG_DATA the parts are synthetic alone.
 """
 

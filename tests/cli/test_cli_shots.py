@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -106,14 +107,12 @@ def test_verbs_go_over_the_shots_or_list_them(cli: Run, split: Path) -> None:
         assert "shots/001" in err
 
 
-def test_one_shot_refuses_to_split_and_warns(cli: Run, joined: Path, tmp_path: Path) -> None:
-    code, out, _ = cli("reconstruct", joined, "--out", tmp_path / "one", "--one-shot", *QUICK)
+def test_one_shot_refuses_to_split_and_warns(cli: Run, joined: Path, split: Path, tmp_path: Path) -> None:
+    run = tmp_path / "one"
+    shutil.copytree(split, run)
+    code, out, _ = cli("reconstruct", joined, "--out", run, "--overwrite", "--one-shot", *QUICK)
     assert code == 0
     assert "warning: there are cuts at frame 8, 16" in out
-    assert not (tmp_path / "one" / "shots").exists()
-    assert cli("reconstruct", joined, "--out", tmp_path / "one", "--overwrite", *QUICK)[0] == 0
-    assert (tmp_path / "one" / "shots" / "001").is_dir()
-    code, out, _ = cli("reconstruct", joined, "--out", tmp_path / "one", "--overwrite", "--one-shot", *QUICK)
-    assert code == 0
-    assert not (tmp_path / "one" / "shots").exists()
-    assert not (tmp_path / "one" / "shots.json").exists()
+    assert not (run / "shots").exists()
+    assert not (run / "shots.json").exists()
+    assert (run / "reconstruction.npz").is_file()

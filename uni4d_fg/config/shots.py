@@ -36,6 +36,12 @@ class ShotsConfig(Section):
     min_lasting_similarity: float = setting(
         0.6, "Correlation of a patch with what it was at the beginning of such a span.", gt=0, lt=1
     )
+    sure_blend: float = setting(
+        0.95,
+        "Part of the variance that a blend explains, from which twice as many corners may outlive a dissolve.",
+        gt=0,
+        le=1,
+    )
     max_motion: float = setting(
         0.1, "Motion from frame to frame, part of the image, within which dissolves are looked for.", gt=0, lt=1
     )

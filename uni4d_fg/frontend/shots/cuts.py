@@ -72,6 +72,8 @@ class _Dissolve:
     cut: Cut
     is_whole: bool
     """Both ends of the span are beyond it."""
+    explained: float
+    """Part of the variance of its frames that a blend explains."""
     rank: tuple[float, float]
     """The lowest is believed: the steepest change, in the middle of its span."""
 
@@ -150,8 +152,8 @@ class _Search:
         for span in [*followed, *self.gaps]:
             # The longer the span, the fewer corners outlive it in a video without any cut.
             limit = self.config.max_surviving * shortest / (span.last - span.first)
-            candidate = self.dissolve(span) if span.alive <= limit else None
-            if candidate is not None:
+            candidate = self.dissolve(span) if span.alive <= 2.0 * limit else None
+            if candidate is not None and (span.alive <= limit or candidate.explained >= self.config.sure_blend):
                 found.append(candidate)
         kept: list[Cut] = []
         apart = self.config.look_around
@@ -217,7 +219,8 @@ class _Search:
             return None  # ordinary motion fades from one end of a span to the other like this
         is_whole = bool(shares[1] < 0.1 and shares[-2] > 0.9 and stop > a + 1 and start < b)
         off_center = abs(stop + start - a - b) / (b - a)
-        return _Dissolve(Cut(stop, start), is_whole, ((start - stop) * (1.0 if is_whole else 1.5), off_center))
+        quality = float(explained[mixed].mean())
+        return _Dissolve(Cut(stop, start), is_whole, quality, ((start - stop) * (1.0 if is_whole else 1.5), off_center))
 
     def accumulated(self, a: int, b: int) -> FloatArray:
         """Return the (2, 3) motion of pixels from one frame to a later one, step by step."""
