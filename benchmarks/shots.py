@@ -2,12 +2,11 @@
 
     UNI4D_FG_DATA=/path/to/sequences python benchmarks/shots.py [--clips 40] [--seed 0] [--show]
 
-Each clip joins two to four parts of kitchen, kitchen_dog, lady_running and synthetic scenes (upright, mirrored or upside
-down, so that neighbors never show the same place), by hard cuts or dissolves of 4 to 24 frames. In the middle of the
-parts, outside the dissolves, there are traps: flashes of one to three frames, changes of exposure, whip pans (a crop that
-is swept over the image, or a camera that is turned in the synthetic room, both with motion blur; no flash with a whip
-pan). A hard cut counts as found at its frame exactly, a dissolve
-where the cut lies within its frames. Without UNI4D_FG_DATA the parts are synthetic alone.
+Each clip joins two to four parts of kitchen, kitchen_dog, lady_running and synthetic scenes (upright, mirrored or
+upside down, so that neighbors never show the same place), by hard cuts or dissolves of 4 to 13 frames. In the middle of
+the parts, outside the dissolves, there are traps: flashes of one to three frames, changes of exposure, whip pans (a crop
+that is swept over the image, or a camera that is turned in the synthetic room, both with motion blur; no flash with a
+whip pan). A hard cut counts as found at its frame exactly, a dissolve where the cut lies within its frames. Without UNI4D_FG_DATA the parts are synthetic alone.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import argparse
 import os
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -41,6 +41,7 @@ class Change:
 
     @property
     def is_hard(self) -> bool:
+        """Whether no frame lies between the shots."""
         return self.stop == self.start
 
 
@@ -189,7 +190,7 @@ def make_clip(found: dict[str, ImageArray], seed: int) -> tuple[ImageArray, list
         looks.append(look)
         parts.append(part(frames, name, rng))
     lengths = [int(rng.choice([0, 0, 4, 8, 12, 16, 24])) for _ in parts[1:]]
-    room = [min(len(a), len(b)) // 3 for a, b in zip(parts, parts[1:], strict=False)]
+    room = [min(len(a), len(b)) // 3 for a, b in pairwise(parts)]
     lengths = [min(length, most) for length, most in zip(lengths, room, strict=True)]
     return *joined(parts, lengths), names
 

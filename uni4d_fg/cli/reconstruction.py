@@ -61,8 +61,8 @@ def reconstruct(
 ) -> None:
     """Reconstruct a video: cameras, static points, motion and depth, written to a run folder.
 
-    Each shot of a video with cuts becomes a run of its own (RUN/shots/000, ...), unless it was measured otherwise (--imu,
-    --odometry, --gps, --relative-poses), which makes it one recording.
+    Each shot of a video with cuts becomes a run of its own (RUN/shots/000, ...), unless other measurements (--imu,
+    --odometry, --gps, --relative-poses) make it one recording.
 
     Cues that the video does not bring are made: depth by a network or from camera motion, masks by a segmenter or from
     motion, tracks by a network or the built-in tracker.

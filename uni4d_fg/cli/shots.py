@@ -45,7 +45,7 @@ def cuts_of(video: Video, config: ShotsConfig, quiet: bool) -> tuple[Cut, ...]:
 def shots_between(cuts: tuple[Cut, ...], source: SequenceInput, num_frames: int, min_frames: int) -> list[Shot]:
     """Return the shots of a video, those that are too short without a folder."""
     begins, ends = [0, *(cut.start for cut in cuts)], [*(cut.stop for cut in cuts), num_frames]
-    shots = []
+    shots: list[Shot] = []
     for begin, end in zip(begins, ends, strict=True):
         if end <= begin:
             continue
@@ -61,7 +61,9 @@ def shots_between(cuts: tuple[Cut, ...], source: SequenceInput, num_frames: int,
 def one_shot_warning(cuts: tuple[Cut, ...], source: SequenceInput) -> str:
     """Return what to distrust in a video with cuts that is solved as one shot."""
     frames = ", ".join(str(source.start + cut.frame * source.stride) for cut in cuts)
-    return f"there are cuts at frame {frames}: it was solved as one shot nevertheless, and what lies behind one is wrong"
+    return (
+        f"there are cuts at frame {frames}: it was solved as one shot nevertheless, and what lies behind one is wrong"
+    )
 
 
 def check_same_split(run: Path, split: bool, *, resume: bool) -> None:

@@ -24,8 +24,8 @@ from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import Reconstruction
 
 _CUTS = (
-    "there are cuts at frame {frames}: the video was solved as one shot nevertheless; `uni4d-fg reconstruct` makes each "
-    "shot a run of its own"
+    "there are cuts at frame {frames}: the video was solved as one shot nevertheless; `uni4d-fg reconstruct` makes "
+    "each shot a run of its own"
 )
 
 

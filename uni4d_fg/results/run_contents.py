@@ -40,7 +40,9 @@ _KNOWN = {
     "clouds/dynamic": re.compile(r"\d{5,}\.ply"),
     "pictures": re.compile(r"(trajectory|depth|scene)\.png"),
     "graphs": re.compile(r"\w+\.(graph\.npz|initial\.values|final\.values)"),
-    "stages": re.compile(r"(tracks|lens|camera_init|bundle_adjustment|nonrigid|joint|fusion|stream|tracks-[0-9a-f]{32})\.npz"),
+    "stages": re.compile(
+        r"(tracks|lens|camera_init|bundle_adjustment|nonrigid|joint|fusion|stream|tracks-[0-9a-f]{32})\.npz"
+    ),
     "stages/windows": re.compile(r"(scene|motion|calibration)_\d{6,}\.npz"),
     "stages/stream": re.compile(r"\d{6,}\.npz"),
     "cues": re.compile(r"cues\.json"),

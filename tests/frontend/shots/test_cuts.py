@@ -82,15 +82,15 @@ def test_a_whip_pan_is_no_cut(step: int) -> None:
     assert cuts(np.stack(frames)) == ()
 
 
-@pytest.mark.parametrize("length", [8, 14])
+@pytest.mark.parametrize("length", [8, 14, 22])
 def test_a_dissolve_is_one_cut_and_its_frames_are_of_neither_shot(length: int) -> None:
-    one, other = shot(0, 30).astype(float), shot(1, 30).astype(float)
+    one, other = shot(0, 40).astype(float), shot(1, 40).astype(float)
     alpha = (np.arange(1, length + 1) / (length + 1))[:, None, None]
-    blend = (1 - alpha) * one[30 - length :] + alpha * other[:length]
-    found = cuts(np.concatenate((one[: 30 - length], blend, other[length:])).astype(np.uint8))
+    blend = (1 - alpha) * one[40 - length :] + alpha * other[:length]
+    found = cuts(np.concatenate((one[: 40 - length], blend, other[length:])).astype(np.uint8))
     assert len(found) == 1
-    assert abs(found[0].stop - (30 - length)) <= 2
-    assert abs(found[0].start - 30) <= 2
+    assert abs(found[0].stop - (40 - length)) <= 2
+    assert abs(found[0].start - 40) <= 2
 
 
 def test_a_fade_through_black_is_one_cut() -> None:

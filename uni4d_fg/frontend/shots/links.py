@@ -208,7 +208,6 @@ def flow(
 
 def _inside(points: Float32Array, size: tuple[int, int]) -> BoolArray:
     height, width = size
-    inside: BoolArray = (
-        (points >= _BORDER).all(axis=1) & (points <= (width - 1 - _BORDER, height - 1 - _BORDER)).all(axis=1)
-    )
-    return inside
+    low: BoolArray = np.asarray((points >= _BORDER).all(axis=1))
+    high: BoolArray = np.asarray((points <= (width - 1 - _BORDER, height - 1 - _BORDER)).all(axis=1))
+    return low & high

@@ -1,7 +1,7 @@
 """How many corners outlive a span of frames: across a dissolve all of them fade away, wherever they are.
 
-Corners of every few frames are followed from frame to frame, and at the end of a span compared with what they looked like
-at its beginning. Those that leave the image count neither way.
+Corners of every few frames are followed from frame to frame, and at the end of a span compared with what they looked
+like at its beginning. Those that leave the image count neither way.
 """
 
 from __future__ import annotations
@@ -92,8 +92,10 @@ def _follow(following: list[_Corners], source: SmallFrame, target: SmallFrame, c
     kept = found & found_back & (np.linalg.norm(back - points, axis=1) <= config.forward_backward_px)
     height, width = target.size
     margin = _BORDER * max(height, width)
-    outside = (moved < margin).any(axis=1) | (moved > (width - 1 - margin, height - 1 - margin)).any(axis=1)
-    beyond = (moved < 2).any(axis=1) | (moved > (width - 3, height - 3)).any(axis=1)
+    outside: BoolArray = np.asarray(
+        ((moved < margin) | (moved > (width - 1 - margin, height - 1 - margin))).any(axis=1), np.bool_
+    )
+    beyond: BoolArray = np.asarray(((moved < 2) | (moved > (width - 3, height - 3))).any(axis=1), np.bool_)
     begin = 0
     for corners, rows in zip(following, chosen, strict=True):
         part = slice(begin, begin + len(rows))
