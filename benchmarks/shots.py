@@ -4,9 +4,10 @@
 
 Each clip joins two to four parts of kitchen, kitchen_dog, lady_running and synthetic scenes (upright, mirrored or
 upside down, so that neighbors never show the same place), by hard cuts or dissolves of 4 to 13 frames. In the middle of
-the parts, outside the dissolves, there are traps: flashes of one to three frames, changes of exposure, whip pans (a crop
-that is swept over the image, or a camera that is turned in the synthetic room, both with motion blur; no flash with a
-whip pan). A hard cut counts as found at its frame exactly, a dissolve where the cut lies within its frames. Without UNI4D_FG_DATA the parts are synthetic alone.
+the parts, outside the dissolves, there are traps: flashes of one to three frames, changes of exposure, whip pans (a
+crop that is swept over the image, or a camera that is turned in the synthetic room, both with motion blur; no flash
+with a whip pan). A hard cut counts as found at its frame exactly, a dissolve where the cut lies within its frames.
+Without UNI4D_FG_DATA the parts are synthetic alone.
 """
 
 from __future__ import annotations

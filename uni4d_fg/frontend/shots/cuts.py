@@ -3,8 +3,8 @@
 Two frames are connected where the corners of one are found in the other
 (:mod:`uni4d_fg.frontend.shots.links`). A hard cut is a place that no pair of frames around it connects: a flash, a
 change of exposure or a frame that shows nothing is bridged by the frames beside it, and a whip pan by the overlap of
-its frames. Across a dissolve every frame is connected with the next, but no corner lasts from one end of it to the other
-(:mod:`uni4d_fg.frontend.shots.survival`), and what lies between is a blend of both,
+its frames. Across a dissolve every frame is connected with the next, but no corner lasts from one end of it to the
+other (:mod:`uni4d_fg.frontend.shots.survival`), and what lies between is a blend of both,
 ``I_s = alpha A + beta B + c`` (both moved along with the camera).
 """
 
@@ -221,8 +221,6 @@ class _Search:
         is_whole = bool(shares[1] < 0.1 and shares[-2] > 0.9 and stop > a + 1 and start < b)
         off_center = abs(stop + start - a - b) / (b - a)
         quality = float(explained[mixed].mean())
-        if not is_whole and start - stop > 0.55 * (b - a) and quality < self.config.sure_blend:
-            return None  # one end is open, and so is whether it is a blend at all
         return _Dissolve(Cut(stop, start), is_whole, quality, ((start - stop) * (1.0 if is_whole else 1.5), off_center))
 
     def accumulated(self, a: int, b: int) -> FloatArray:
