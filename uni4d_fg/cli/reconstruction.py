@@ -105,7 +105,7 @@ def reconstruct(
     with run_lock(run):
         prepare_run_folder(run, source, resume=resume, overwrite=overwrite)
         looked_for = settings.shots.split == "auto" and not is_measured
-        cuts = shots.cuts_of(opened.video, settings.shots, quiet) if looked_for else ()
+        cuts = shots.cuts_of(opened.video, settings.shots) if looked_for else ()
         split = bool(cuts) and not one_shot
         shots.check_same_split(run, split, resume=resume)
         if split:

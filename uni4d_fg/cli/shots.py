@@ -11,7 +11,6 @@ import typer
 
 from uni4d_fg.cli.console import one_line, print_error, print_json
 from uni4d_fg.cli.interruption import Interruption, resume_command
-from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder, shot_of
 from uni4d_fg.config.shots import ShotsConfig
 from uni4d_fg.errors import Cancelled, OutputError, Uni4dFgError
@@ -28,18 +27,15 @@ Solve = Callable[["Video", Path, bool], "tuple[RunSummary, Sequence]"]
 """Reconstructs a video into a run folder; whether it may take over what is there."""
 
 
-def cuts_of(video: Video, config: ShotsConfig, quiet: bool) -> tuple[Cut, ...]:
-    """Look for cuts, with progress.
+def cuts_of(video: Video, config: ShotsConfig) -> tuple[Cut, ...]:
+    """Look for cuts; Ctrl-C ends the search.
 
     Raises:
         InputError: If a frame cannot be read.
         Cancelled: If Ctrl-C was pressed.
     """
-    with Interruption() as stop, progress_reporter(quiet) as reporter:
-        reporter.begin("cuts", None)
-        cuts = find_cuts(video.images, config, stop)
-        reporter.end("" if not cuts else f"{len(cuts)} found")
-    return cuts
+    with Interruption() as stop:
+        return find_cuts(video.images, config, stop)
 
 
 def shots_between(cuts: tuple[Cut, ...], source: SequenceInput, num_frames: int, min_frames: int) -> list[Shot]:
