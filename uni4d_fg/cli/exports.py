@@ -51,6 +51,9 @@ def export(
     from uni4d_fg.frontend.sequence.model import Sequence
     from uni4d_fg.results.export import ExportOptions, export_run
     from uni4d_fg.results.run import Run
+    from uni4d_fg.results.shot_list import refuse_split
+
+    refuse_split(run)
 
     def open_sequence() -> Sequence:
         stored = stored_input(run)

@@ -67,6 +67,9 @@ IntrinsicsFile = Annotated[
         "--intrinsics", help="Calibration: .npy, COLMAP, OpenCV, ROS, Kalibr, nerfstudio.", show_default=False
     ),
 ]
+OneShot = Annotated[
+    bool, typer.Option("--one-shot", help="Solve the video as one shot, whatever cuts are found; they are named.")
+]
 Imu = Annotated[
     Path | None,
     typer.Option(

@@ -52,6 +52,7 @@ def reconstruct(
     odometry: options.OdometryFile = None,
     gps: options.GpsFile = None,
     relative_poses: options.RelativePosesFile = None,
+    one_shot: options.OneShot = False,
     layout: options.Layout = LayoutChoice.auto,
     depth_gt_scale: options.DepthScale = 1000.0,
     known_intrinsics: options.KnownIntrinsics = False,
@@ -60,9 +61,13 @@ def reconstruct(
 ) -> None:
     """Reconstruct a video: cameras, static points, motion and depth, written to a run folder.
 
+    Each shot of a video with cuts becomes a run of its own (RUN/shots/000, ...), unless other measurements (--imu,
+    --odometry, --gps, --relative-poses) make it one recording.
+
     Cues that the video does not bring are made: depth by a network or from camera motion, masks by a segmenter or from
     motion, tracks by a network or the built-in tracker.
     """
+    from uni4d_fg.cli import shots
     from uni4d_fg.config.load import load_config
     from uni4d_fg.frontend.measurements.imu import read_imu
     from uni4d_fg.pipeline.inertial import check_goes_with_imu
@@ -86,15 +91,34 @@ def reconstruct(
         samples.check_covers(opened.video.timestamps)
     plan = source.plan(opened)
     plan.check()
+    files = MeasurementFiles(odometry, gps, relative_poses)
+    is_measured = any(given is not None for given in (imu, odometry, gps, relative_poses))
+
+    def solve(video: Video, folder: Path, again: bool, warnings: tuple[str, ...] = ()) -> tuple[RunSummary, Sequence]:
+        sequence, report = run_cues(video, plan, folder, settings, quiet=quiet)
+        chosen = settings if report is None or report.settings is None else report.settings
+        return run_pipeline(
+            sequence, folder, chosen, resume=again, quiet=quiet, cues=report, measurements=files, imu=samples,
+            warnings=warnings,
+        ), sequence  # fmt: skip
+
     with run_lock(run):
         prepare_run_folder(run, source, resume=resume, overwrite=overwrite)
-        sequence, report = run_cues(opened.video, plan, run, settings, quiet=quiet)
-        if report is not None and report.settings is not None:
-            settings = report.settings
-        files = MeasurementFiles(odometry, gps, relative_poses)
-        summary = run_pipeline(
-            sequence, run, settings, resume=resume, quiet=quiet, cues=report, measurements=files, imu=samples
-        )
+        looked_for = settings.shots.split == "auto" and not is_measured
+        cuts = shots.cuts_of(opened.video, settings.shots) if looked_for else ()
+        split = bool(cuts) and not one_shot
+        shots.check_same_split(run, split, resume=resume)
+        if split:
+            found = shots.shots_between(cuts, source, opened.video.num_frames, settings.shots.min_frames)
+            done, summaries, failure = shots.reconstruct_shots(
+                run, source, opened.video, found, solve, resume=resume, overwrite=overwrite
+            )
+            shots.print_shots(run, done, summaries, json)
+            if failure is not None:
+                raise failure
+            return
+        warnings = (shots.one_shot_warning(cuts, source),) if cuts else ()
+        summary, _ = solve(opened.video, run, resume, warnings)
     if json:
         print_json(summary.to_dict())
     else:
@@ -169,7 +193,7 @@ def class_list(classes: str | None) -> tuple[str, ...] | None:
 def run_pipeline(
     sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None,
     imu: ImuSamples | None = None,
-    measurements: MeasurementFiles | None = None,
+    measurements: MeasurementFiles | None = None, warnings: tuple[str, ...] = (),
 ) -> RunSummary:  # fmt: skip
     """Reconstruct with progress; Ctrl-C ends the run cleanly and says how to go on.
 
@@ -183,6 +207,7 @@ def run_pipeline(
             return reconstruct_sequence(
                 sequence, run, config, resume=resume, reporter=reporter, should_stop=stop,
                 cues=None if cues is None else cues.to_dict(), measurements=measurements, imu=imu,
+                warnings=warnings,
             )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"finished stages are kept in {run}; continue with: {resume_command()}") from error

@@ -25,17 +25,22 @@ def evaluate(
     """Score a run against the ground truth of its sequence."""
     from uni4d_fg.results.evaluate.run import evaluate_run
     from uni4d_fg.results.evaluate.table import format_report
+    from uni4d_fg.results.shot_list import finished_shots, is_split, refuse_split
 
-    source = stored_input(run)
     if sequence is not None:
-        source = SequenceInput.of(
-            sequence, layout, depth, None, None, depth_gt_scale=depth_gt_scale, known_intrinsics=False
-        )
-    report = evaluate_run(run, source.read(), max_depth_m=max_depth)
+        refuse_split(run)
+    reports = []
+    for folder in finished_shots(run) if is_split(run) else [run]:
+        source = stored_input(folder)
+        if sequence is not None:
+            source = SequenceInput.of(
+                sequence, layout, depth, None, None, depth_gt_scale=depth_gt_scale, known_intrinsics=False
+            )
+        reports.append(evaluate_run(folder, source.read(), max_depth_m=max_depth))
     if json:
-        print_json(report.to_dict())
+        print_json([report.to_dict() for report in reports] if is_split(run) else reports[0].to_dict())
     else:
-        typer.echo(format_report(report), nl=False)
+        typer.echo("\n".join(format_report(report) for report in reports), nl=False)
 
 
 def config(

@@ -225,6 +225,12 @@ def _beside(root: Path, value: str) -> Path:
     return inside if root.is_dir() and is_present(inside) else Path(value)
 
 
+def shot_of(source: SequenceInput, first: int, count: int) -> SequenceInput:
+    """Return ``count`` of the frames that an input selects, from its ``first`` on."""
+    start = source.start + first * source.stride
+    return replace(source, start=start, stop=start + (count - 1) * source.stride + 1)
+
+
 def prepare_run_folder(
     folder: Path, source: SequenceInput, *, resume: bool, overwrite: bool, whole: bool = False
 ) -> None:

@@ -48,14 +48,20 @@ def report(
 ) -> None:
     """Write one self-contained HTML page about a run: what was done, how well, and what to distrust."""
     from uni4d_fg.results.report.build import write_report
+    from uni4d_fg.results.shot_list import finished_shots, is_split, refuse_split
 
-    path = out or RunFolder(run).report
-    write_report(_open(run), path)
-    typer.echo(f"report: {path}")
+    if out is not None:
+        refuse_split(run)
+    for folder in finished_shots(run) if is_split(run) else [run]:
+        path = out or RunFolder(folder).report
+        write_report(_open(folder), path)
+        typer.echo(f"report: {path}")
 
 
 def _open(run: Path) -> Run:
     from uni4d_fg.cli.runs import stored_input
     from uni4d_fg.results.run import Run
+    from uni4d_fg.results.shot_list import refuse_split
 
+    refuse_split(run)
     return Run(run, lambda: stored_input(run).read())

@@ -18,6 +18,7 @@ from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
+from uni4d_fg.config.shots import ShotsConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, FusionConfig, JointConfig, NonRigidConfig
 from uni4d_fg.config.windows import WindowsConfig
 
@@ -56,6 +57,7 @@ class Config(Section):
         basic=True,
     )
     input: InputConfig = setting(InputConfig(), "Use of what the sequence brings.", basic=True)
+    shots: ShotsConfig = setting(ShotsConfig(), "Cuts of an edited video.", basic=True)
     camera: CameraConfig = setting(CameraConfig(), "Camera model.", basic=True)
     tracking: TrackingConfig = setting(TrackingConfig(), "Built-in tracker.", basic=True)
     labels: LabelConfig = setting(LabelConfig(), "Track labels.", basic=True)

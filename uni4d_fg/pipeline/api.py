@@ -14,6 +14,7 @@ from uni4d_fg.frontend.measurements.imu import ImuSamples, read_imu
 from uni4d_fg.frontend.sequence import model
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.open_video import open_video
+from uni4d_fg.frontend.shots.cuts import find_cuts
 from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.pipeline.measurements import MeasurementFiles
 from uni4d_fg.pipeline.run import reconstruct as reconstruct_sequence
@@ -21,6 +22,11 @@ from uni4d_fg.progress import Reporter
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import Reconstruction
+
+_CUTS = (
+    "there are cuts at frame {frames}: the video was solved as one shot nevertheless; `uni4d-fg reconstruct` makes "
+    "each shot a run of its own"
+)
 
 
 def reconstruct(
@@ -36,6 +42,8 @@ def reconstruct(
     reporter: Reporter | None = None,
 ) -> Reconstruction:
     """Reconstruct a video and write the run folder; cues that it does not bring are made.
+
+    The video is one shot; where cuts are found in it, the summary warns of them.
 
     Args:
         source: Video file, folder of images, sequence folder, or an opened sequence with all its cues.
@@ -59,12 +67,15 @@ def reconstruct(
     folder = Path(run)
     settings = config if isinstance(config, Config) else load_config(config, changes)
     samples = read_imu(Path(imu)) if isinstance(imu, str | Path) else imu
-    report = None
+    report, warnings = None, []
     if isinstance(source, model.Sequence):
         sequence = source
     else:
         path = Path(source)
         video = open_video(path)
+        if settings.shots.split == "auto" and samples is None and measurements is None:
+            frames = ", ".join(str(cut.frame) for cut in find_cuts(video.images, settings.shots))
+            warnings = [_CUTS.format(frames=frames)] if frames else []
         plan = plan_cues(video, bare=path.is_file() or video.depths is None)
         if plan.is_given:
             sequence = as_sequence(replace(video, masks=None) if plan.masks == "none" else video)
@@ -77,6 +88,6 @@ def reconstruct(
     cues = None if report is None else report.to_dict()
     reconstruct_sequence(
         sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions,
-        measurements=measurements, imu=samples,
+        measurements=measurements, imu=samples, warnings=warnings,
     )  # fmt: skip
     return load_reconstruction(RunFolder(folder).reconstruction)

@@ -125,6 +125,7 @@ def reconstruct(
     additions: Iterable[FactorSource] = (),
     measurements: MeasurementFiles | None = None,
     imu: ImuSamples | None = None,
+    warnings: Iterable[str] = (),
 ) -> RunSummary:
     """Reconstruct a sequence and write the run folder.
 
@@ -141,6 +142,7 @@ def reconstruct(
             :data:`~uni4d_fg.optim.added_factors.FactorSource`.
         measurements: Files of odometry, GPS and relative poses that join bundle adjustment; ``resume`` compares them.
         imu: Inertial measurements over all frames, on their clock, for stage 2.
+        warnings: What else the summary should warn of.
 
     Returns:
         The summary that is also written as ``summary.json``.
@@ -161,14 +163,14 @@ def reconstruct(
         mark_run(run_dir)
         return _reconstruct(
             recorder, sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False),
-            cues or {}, additions, measurements or MeasurementFiles(), imu,
+            cues or {}, additions, measurements or MeasurementFiles(), imu, warnings,
         )  # fmt: skip
 
 
 def _reconstruct(
     recorder: RecordingRunner, sequence: Sequence, run_dir: Path, config: Config, resume: bool, reporter: Reporter,
     should_stop: Callable[[], bool], cues: dict[str, Any], additions: Iterable[FactorSource],
-    measurements: MeasurementFiles, imu: ImuSamples | None,
+    measurements: MeasurementFiles, imu: ImuSamples | None, warnings: Iterable[str],
 ) -> RunSummary:  # fmt: skip
     measured = read_measurements(measurements, sequence.timestamps, config.measurements)
     sources = (*additions, *measured.sources)
@@ -189,7 +191,7 @@ def _reconstruct(
         },
         solver_facts(config),
         cues=cues,
-        warnings=[*cues.get("warnings", []), *measured.warnings],
+        warnings=[*cues.get("warnings", []), *measured.warnings, *warnings],
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,

@@ -32,7 +32,7 @@ _MAX_MARKER_BYTES = 64 * 1024**2
 _TEMPORARY = re.compile(r"\.tmp-[0-9a-f]{8}-(?P<name>.+)")
 _ROOT_FILES = (
     MARKER, "input.json", "config.yaml", "summary.json", "reconstruction.npz", "trajectory.tum", "depth.npy",
-    "labels.npz", "report.html",
+    "labels.npz", "report.html", "shots.json",
 )  # fmt: skip
 _KNOWN = {
     "": re.compile("|".join(map(re.escape, _ROOT_FILES))),
@@ -102,7 +102,13 @@ def remove_results(root: Path) -> None:
     for path in sorted((root / "export").iterdir()) if _is_own_folder(root / "export") else ():
         if is_export(path):
             remove_export(path)
-    for name in (*sorted(filter(None, _KNOWN), reverse=True), "export"):
+    for path in sorted((root / "shots").iterdir()) if _is_own_folder(root / "shots") else ():
+        if re.fullmatch(r"\d{3,}", path.name) and _is_own_folder(path) and is_run(path):
+            remove_results(path)
+            if [own.name for own in path.iterdir()] == [MARKER]:
+                _remove(path / MARKER)
+            _remove_if_empty(path)
+    for name in (*sorted(filter(None, _KNOWN), reverse=True), "export", "shots"):
         _remove_if_empty(root / name)
 
 

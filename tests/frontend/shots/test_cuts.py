@@ -1,0 +1,110 @@
+"""Cuts are found where they are; flashes, changes of exposure and whip pans are none."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from uni4d_fg.arrays import ImageArray
+from uni4d_fg.config.shots import ShotsConfig
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.model import ArrayFrames
+from uni4d_fg.frontend.shots.cuts import Cut, find_cuts
+
+CONFIG = ShotsConfig()
+HEIGHT, WIDTH = 120, 160
+
+
+def world(seed: int) -> ImageArray:
+    """A wide picture of structure at several sizes."""
+    rng = np.random.default_rng(seed)
+    size = (2 * HEIGHT, 6 * WIDTH)
+    layers = []
+    for cell in (6, 14, 30):
+        small = rng.uniform(size=(size[0] // cell + 1, size[1] // cell + 1)).astype(np.float32)
+        layers.append(cv2.resize(small, size[::-1], interpolation=cv2.INTER_NEAREST))
+    return np.round(235 * np.mean(layers, axis=0) + 10).astype(np.uint8)
+
+
+def view(picture: ImageArray, x: float) -> ImageArray:
+    begin = round(x)
+    return picture[40 : 40 + HEIGHT, begin : begin + WIDTH]
+
+
+def shot(seed: int, frames: int, speed: float = 1.0) -> ImageArray:
+    picture = world(seed)
+    return np.stack([view(picture, 100 + speed * t) for t in range(frames)])
+
+
+def cuts(frames: ImageArray) -> tuple[Cut, ...]:
+    return find_cuts(ArrayFrames(frames), CONFIG)
+
+
+def test_hard_cuts_are_found_to_the_frame() -> None:
+    clip = np.concatenate((shot(0, 17), shot(1, 23, -2.0), shot(2, 14)))
+    assert cuts(clip) == (Cut(17, 17), Cut(40, 40))
+    color = np.repeat(clip[..., None], 3, axis=-1)
+    assert cuts(color) == cuts(clip)
+
+
+def test_one_shot_has_none() -> None:
+    assert cuts(shot(0, 60, 3.0)) == ()
+    assert cuts(shot(0, 1)) == ()
+
+
+def test_frames_that_show_nothing_have_none() -> None:
+    assert cuts(np.full((20, HEIGHT, WIDTH), 128, np.uint8)) == ()
+
+
+@pytest.mark.parametrize("length", [1, 3])
+@pytest.mark.parametrize("brightness", [120, 255])
+def test_a_flash_is_no_cut(length: int, brightness: int) -> None:
+    clip = shot(0, 40)
+    clip[20 : 20 + length] = np.clip(clip[20 : 20 + length].astype(int) + brightness, 0, 255)
+    assert cuts(clip) == ()
+
+
+def test_a_change_of_exposure_is_no_cut() -> None:
+    clip = shot(0, 40)
+    clip[20:] = clip[20:] * 0.4
+    assert cuts(clip) == ()
+
+
+@pytest.mark.parametrize("step", [20, 50])
+def test_a_whip_pan_is_no_cut(step: int) -> None:
+    picture = world(0)
+    at = np.concatenate((np.arange(20), 20 + step * np.arange(6), 20 + 5 * step + np.arange(1, 20))).astype(float)
+    frames = []
+    for x, following in zip(at, np.append(at[1:], at[-1]), strict=True):
+        open_part = np.linspace(x, x + 0.5 * (following - x), 8)
+        frames.append(np.mean([view(picture, 50 + p) for p in open_part], axis=0).astype(np.uint8))
+    assert cuts(np.stack(frames)) == ()
+
+
+@pytest.mark.parametrize("length", [8, 14])
+def test_a_dissolve_is_one_cut_and_its_frames_are_of_neither_shot(length: int) -> None:
+    one, other = shot(0, 40).astype(float), shot(1, 40).astype(float)
+    alpha = (np.arange(1, length + 1) / (length + 1))[:, None, None]
+    blend = (1 - alpha) * one[40 - length :] + alpha * other[:length]
+    found = cuts(np.concatenate((one[: 40 - length], blend, other[length:])).astype(np.uint8))
+    assert len(found) == 1
+    assert abs(found[0].stop - (40 - length)) <= 2
+    assert abs(found[0].start - 40) <= 2
+
+
+def test_a_fade_through_black_is_one_cut() -> None:
+    one, other = shot(0, 20), shot(1, 20)
+    found = cuts(np.concatenate((one, np.zeros((6, HEIGHT, WIDTH), np.uint8), other)))
+    assert found == (Cut(20, 26),)
+
+
+def test_black_frames_within_a_shot_are_no_cut() -> None:
+    clip = shot(0, 40)
+    clip[18:24] = 0
+    assert cuts(clip) == ()
+
+
+def test_a_search_can_be_stopped() -> None:
+    with pytest.raises(Cancelled):
+        find_cuts(ArrayFrames(shot(0, 10)), CONFIG, lambda: True)

@@ -1,0 +1,1 @@
+"""Cuts of an edited video: hard ones and dissolves."""

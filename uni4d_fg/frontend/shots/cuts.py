@@ -1,0 +1,280 @@
+"""Cuts of a video, found by what is seen again on their other side.
+
+Two frames are connected where the corners of one are found in the other
+(:mod:`uni4d_fg.frontend.shots.links`). A hard cut is a place that no pair of frames around it connects: a flash, a
+change of exposure or a frame that shows nothing is bridged by the frames beside it, and a whip pan by the overlap of
+its frames. Across a dissolve every frame is connected with the next, but no corner lasts from one end of it to the
+other (:mod:`uni4d_fg.frontend.shots.survival`), and what lies between is a blend of both,
+``I_s = alpha A + beta B + c`` (both moved along with the camera).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, ImageArray
+from uni4d_fg.config.shots import ShotsConfig
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.frontend.shots.links import SmallFrame, link, pan_between, small_frame
+from uni4d_fg.frontend.shots.survival import Span, spans
+
+_REST = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_BLUR_PX = 2.0
+_PURE = 0.08
+"""Share of the other shot that cannot be seen."""
+
+
+@dataclass(frozen=True, order=True)
+class Cut:
+    """One change of shot. Frames ``stop`` to ``start - 1`` are of neither (a blend, black); none at a hard cut."""
+
+    stop: int
+    """First frame that is not of the shot before."""
+    start: int
+    """First frame of the shot behind."""
+
+    @property
+    def frame(self) -> int:
+        """The middle of it; at a hard cut the first frame of the shot behind."""
+        return (self.stop + self.start) // 2
+
+
+def find_cuts(
+    images: FrameSource[ImageArray], config: ShotsConfig, should_stop: Callable[[], bool] | None = None
+) -> tuple[Cut, ...]:
+    """Find the cuts of a video, in order; each frame is read once.
+
+    Args:
+        images: T images (H, W, 3) or (H, W), uint8.
+        config: Sizes and checks.
+        should_stop: Asked before every frame.
+
+    Raises:
+        InputError: If a frame cannot be read.
+        Cancelled: If ``should_stop`` said so.
+    """
+    frames = []
+    for number, image in enumerate(images):
+        if should_stop is not None and should_stop():
+            raise Cancelled(f"the search for cuts stopped at frame {number} of {len(images)}")
+        frames.append(small_frame(image, config))
+    if len(frames) < 2:
+        return ()
+    return _Search(frames, config).run()
+
+
+@dataclass(frozen=True)
+class _Dissolve:
+    cut: Cut
+    is_whole: bool
+    """Both ends of the span are beyond it."""
+    explained: float
+    """Part of the variance of its frames that a blend explains."""
+    rank: tuple[float, float]
+    """The lowest is believed: the steepest change, in the middle of its span."""
+
+
+class _Search:
+    def __init__(self, frames: list[SmallFrame], config: ShotsConfig) -> None:
+        self.frames, self.config = frames, config
+        self.motion: list[FloatArray] = [_REST]
+        """From the frame before."""
+        self.broken: list[bool] = [False]
+        self.followed: list[bool] = [False]
+        """Whether corners were found again in it: not in the blur of a pan."""
+        self.gaps: list[Span] = []
+        """Where corners could not be followed, nor be found again soon."""
+
+    def run(self) -> tuple[Cut, ...]:
+        for t in range(1, len(self.frames)):
+            connected, motion = self.connected(t - 1, t)
+            self.broken.append(not connected)
+            self.followed.append(connected and self.has_corners(t - 1, t, motion))
+            self.motion.append(motion if connected else _REST)
+        hard = merged(self.hard_cuts(), self.config.look_around)
+        sharp = [cut for cut in hard if self.is_sharp(cut)]
+        soft = [d for d in self.dissolves() if all(cut.start < d.stop or d.start < cut.stop for cut in sharp)]
+        # A short dissolve is found both ways, and its extent by the second.
+        alone = [c for c in hard if not any(d.stop - 2 <= c.start and c.stop <= d.start + 2 for d in soft)]
+        return tuple(merged(sorted([*alone, *soft]), self.config.look_around))
+
+    def connected(self, a: int, b: int) -> tuple[bool, FloatArray]:
+        """Tell whether two frames show one scene, and how pixels of the one move to the other."""
+        one, other = self.frames[a], self.frames[b]
+        if not (one.shows_something and other.shows_something):
+            return False, _REST
+        config = self.config
+        best = link(one, other, _REST, config)
+        if best.found >= config.max_broken:
+            return True, best.source_T_target
+        similarity, shift = pan_between(one, other, config.min_overlap)
+        return similarity >= config.pan_similarity, shift
+
+    def has_corners(self, a: int, b: int, motion: FloatArray) -> bool:
+        """Tell whether corners of one frame are found in the other, with what is known of the motion."""
+        return link(self.frames[a], self.frames[b], motion, self.config).found >= self.config.max_broken
+
+    def hard_cuts(self) -> list[Cut]:
+        shows = [frame.shows_something for frame in self.frames]
+        seen = np.flatnonzero(shows)
+        cuts = []
+        for before, behind in zip(seen[:-1].tolist(), seen[1:].tolist(), strict=True):
+            if (behind == before + 1 and not self.broken[behind]) or self.is_bridged(before, behind):
+                continue
+            cuts.append(Cut(before + 1, behind))
+        return cuts
+
+    def is_bridged(self, before: int, behind: int) -> bool:
+        """Tell whether any frame up to ``before`` is connected with any from ``behind`` on, near by."""
+        reach = self.config.look_around
+        for i, j in sorted({(0, k) for k in range(reach)} | {(k, 0) for k in range(reach)}, key=sum):
+            a, b = before - i, behind + j
+            if (i or j or behind > before + 1) and a >= 0 and b < len(self.frames) and self.connected(a, b)[0]:
+                return True
+        return False
+
+    def is_sharp(self, cut: Cut) -> bool:
+        """Tell whether the frames up to a cut show nothing of what is behind it, and the other way round."""
+        a, b = cut.stop - 3, cut.start + 2
+        if cut.stop != cut.start or a < 0 or b >= len(self.frames):
+            return False
+        shares, _ = self.blend(a, b)
+        return bool(shares[:2].max() < 0.25 and shares[2:].min() > 0.75)
+
+    def dissolves(self) -> list[Cut]:
+        found: list[_Dissolve] = []
+        shortest = min(self.config.dissolve_spans)
+        followed = list(spans(self.frames, self.steps(), self.config))
+        for span in [*followed, *self.gaps]:
+            # The longer the span, the fewer corners outlive it in a video without any cut.
+            limit = self.config.max_surviving * shortest / (span.last - span.first)
+            candidate = self.dissolve(span) if span.alive <= 2.0 * limit else None
+            if candidate is not None and (span.alive <= limit or candidate.explained >= self.config.sure_blend):
+                found.append(candidate)
+        kept: list[Cut] = []
+        apart = self.config.look_around
+        for candidate in sorted(found, key=lambda d: d.rank):
+            first, last = candidate.cut.stop - apart, candidate.cut.start + apart
+            if all(last <= cut.stop or cut.start <= first for cut in kept):
+                kept.append(candidate.cut)
+        return sorted(self.extended(cut, kept, found) for cut in kept)
+
+    @staticmethod
+    def extended(cut: Cut, kept: list[Cut], found: list[_Dissolve]) -> Cut:
+        """Return a dissolve as the spans saw it that hold the whole of it, and no other."""
+        wider = [
+            d.cut
+            for d in found
+            if d.is_whole
+            and d.cut.stop <= cut.frame <= d.cut.start
+            and d.cut.start - d.cut.stop <= 3 * (cut.start - cut.stop)
+            and all(other == cut or other.start <= d.cut.stop or d.cut.start <= other.stop for other in kept)
+        ]
+        return min(wider, key=lambda c: c.start - c.stop, default=cut)
+
+    def steps(self) -> list[int | None]:
+        """Return from where corners are followed to each frame, as :func:`spans` takes it."""
+        steps: list[int | None] = [None]
+        last = 0
+        limit = self.config.max_motion * max(self.frames[0].size)
+        for t in range(1, len(self.frames)):
+            if last == t - 1 and not self.broken[t]:
+                fast = float(np.hypot(*self.motion[t][:, 2])) > limit
+                steps.append(None if fast or not self.followed[t] else last)
+                last = t
+            elif last < t - 1 and self.connected(last, t)[0]:
+                steps.append(last)
+                last = t
+            elif t - last <= self.config.look_around:
+                steps.append(t)
+            else:
+                self.gaps.append(Span(max(0, last - 3), min(t + 3, len(self.frames) - 1), 0.0))
+                steps.append(None)
+                last = t
+        return steps
+
+    def dissolve(self, span: Span) -> _Dissolve | None:
+        """Return the dissolve that lies between two frames, if what is between them looks like one."""
+        a, b = span.first, span.last
+        if self.connected(a, b)[0]:
+            return None
+        shares, explained = self.blend(a, b)
+        # A flash within is neither side.
+        shares = cv2.medianBlur(shares.astype(np.float32)[None], 5)[0].astype(np.float64)
+        numbers = np.arange(a + 1, b)
+        mixed = (shares > 0.1) & (shares < 0.9)
+        if shares[0] > 0.4 or shares[-1] < 0.6 or mixed.sum() < 2:
+            return None
+        # The ends are blends as well where the dissolve is longer than the span: its rate tells how far it goes.
+        rate, offset = np.polyfit(numbers[mixed], shares[mixed], 1)
+        if rate <= 0.0:
+            return None
+        stop = int(np.clip(np.ceil((_PURE - offset) / rate), a + 1, b))
+        start = int(np.clip(np.floor((1.0 - _PURE - offset) / rate) + 1, stop, b))
+        if stop == a + 1 and start >= b - 1:
+            return None  # ordinary motion fades from one end of a span to the other like this
+        is_whole = bool(shares[1] < 0.1 and shares[-2] > 0.9 and stop > a + 1 and start < b)
+        off_center = abs(stop + start - a - b) / (b - a)
+        quality = float(explained[mixed].mean())
+        return _Dissolve(Cut(stop, start), is_whole, quality, ((start - stop) * (1.0 if is_whole else 1.5), off_center))
+
+    def accumulated(self, a: int, b: int) -> FloatArray:
+        """Return the (2, 3) motion of pixels from one frame to a later one, step by step."""
+        total = np.eye(3)
+        for t in range(a + 1, b + 1):
+            total = np.vstack((self.motion[t], [0.0, 0.0, 1.0])) @ total
+        return total[:2]
+
+    def blend(self, a: int, b: int) -> tuple[FloatArray, FloatArray]:
+        """Fit the frames between two as blends of them.
+
+        Returns:
+            shares: (b - a - 1,) of the second in each, 0 to 1.
+            explained: (b - a - 1,) part of its variance that the blend explains.
+        """
+        shares, explained = [], []
+        height, width = self.frames[a].size
+        everywhere = np.full((height, width), 255, np.uint8)
+        for s in range(a + 1, b):
+            forth = self.accumulated(a, s)
+            back = cv2.invertAffineTransform(self.accumulated(s, b))
+            valid = (cv2.warpAffine(everywhere, forth, (width, height)) > 254) & (
+                cv2.warpAffine(everywhere, back, (width, height)) > 254
+            )
+            images = (
+                cv2.warpAffine(self.frames[a].gray, forth, (width, height), borderMode=cv2.BORDER_REPLICATE),
+                cv2.warpAffine(self.frames[b].gray, back, (width, height), borderMode=cv2.BORDER_REPLICATE),
+                self.frames[s].gray,
+            )
+            first, second, middle = (
+                cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR_PX)[valid].astype(np.float64)
+                for image in images
+            )
+            if valid.mean() < 0.2:
+                shares.append(0.0)
+                explained.append(0.0)
+                continue
+            columns = np.stack((first - first.mean(), second - second.mean()), axis=1)
+            right = middle - middle.mean()
+            weights = np.linalg.lstsq(columns, right, rcond=None)[0]
+            rest = right - columns @ weights
+            alpha, beta = np.maximum(weights, 0.0)
+            shares.append(beta / max(alpha + beta, 1e-9))
+            explained.append(1.0 - float(rest @ rest) / max(float(right @ right), 1e-9))
+        return np.array(shares), np.array(explained)
+
+
+def merged(cuts: list[Cut], distance: int) -> list[Cut]:
+    """Join cuts that leave no shot of ``distance`` frames between them."""
+    result: list[Cut] = []
+    for cut in sorted(cuts):
+        if result and cut.stop - result[-1].start < distance:
+            result[-1] = Cut(result[-1].stop, max(cut.start, result[-1].start))
+        else:
+            result.append(cut)
+    return result
