@@ -88,7 +88,8 @@ def test_the_extension_solves_every_stage(small_scene: Sequence, tmp_path: Path)
             assert part["why"] == ""
             of_kind = used.setdefault(solve["name"].partition("[")[0], {})
             of_kind.setdefault(part["by"], set()).update(part["terms"])
-    cameras = {"camera_rotation", "camera_translation", "intrinsics_prior", "aspect_prior", "log_scale_prior"}
+    motion = {"camera_angular_acceleration", "camera_linear_acceleration"}
+    cameras = motion | {"intrinsics_prior", "aspect_prior", "log_scale_prior"}
     assert used == {
         "camera_init": {"C++ frame pairs": {"depth_reprojection"}},
         "bundle_adjustment": {

@@ -129,7 +129,8 @@ def test_the_worst_landmark_is_the_brightest_and_bridged_points_are_marked(finis
     run = opened(finished_run)
     values = values_of(run)
     colors = Coloring(ColorBy.residual, run, values).landmarks().sum(axis=1)
-    assert colors[np.argmax(values.landmark_error)] == colors.max() > colors[np.argmin(values.landmark_error)]
+    # Sums of three rounded channels: the map of colors may step back by one each.
+    assert colors[np.argmax(values.landmark_error)] + 3 >= colors.max() > colors[np.argmin(values.landmark_error)] + 3
     observed = run.reconstruction.dynamic_observed.copy()
     observed[0, 4] = False
     bridged = run.with_parts(reconstruction=replace(run.reconstruction, dynamic_observed=observed))
