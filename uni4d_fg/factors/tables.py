@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import re
 from pathlib import Path
 
-from uni4d_fg.factors import terms as _declared  # noqa: F401 - declares every factor type of the package
+import uni4d_fg.factors
 from uni4d_fg.factors import variable_types
 from uni4d_fg.factors.factor_type import FactorType, factor_types
 from uni4d_fg.factors.variable import VariableType
@@ -30,6 +32,9 @@ def factors_table(headers: Path) -> str:
     Args:
         headers: Folder of the C++ kernels, ``cpp_factors/include/uni4d_fg/factors``; a header names what it computes.
     """
+    # Declares every factor type of the package, whatever was imported before.
+    for module_info in pkgutil.iter_modules(uni4d_fg.factors.__path__, "uni4d_fg.factors."):
+        importlib.import_module(module_info.name)
     kernels = {name for path in headers.glob("*.hpp") for name in _KERNEL_NAME.findall(path.read_text("utf-8"))}
     lines = [
         "| factor type | reads | data of one row | residual | Jacobian | C++ kernel | GTSAM's own | declared in |",

@@ -7,6 +7,7 @@ from uni4d_fg.factors.camera_priors import fisheye_camera_prior, opencv_camera_p
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, joint_dynamic_depth_prior, static_depth_prior
 from uni4d_fg.factors.depth_reprojection import depth_reprojection
 from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection, joint_dynamic_reprojection
+from uni4d_fg.factors.gps_position import gps_position
 from uni4d_fg.factors.lens_reprojection import fisheye_reprojection, opencv_reprojection
 from uni4d_fg.factors.priors import aspect_prior, intrinsics_prior, log_scale_prior, scale_anchor
 from uni4d_fg.factors.rigid_object import rigid_depth_prior, rigid_reprojection, rigid_smoothness
@@ -26,6 +27,7 @@ __all__ = [
     "dynamic_reprojection",
     "fisheye_camera_prior",
     "fisheye_reprojection",
+    "gps_position",
     "intrinsics_prior",
     "joint_dynamic_depth_prior",
     "joint_dynamic_reprojection",
