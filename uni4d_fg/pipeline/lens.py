@@ -31,13 +31,11 @@ class CameraModel:
     lens: Lens
     intrinsics: FloatArray
     """(4,) px."""
-    is_found: bool = False
-    """Whether both were estimated, so that stages keep the intrinsics: the lens belongs to them."""
 
     def apply(
         self, sequence: Sequence, labelled: LabelledTracks, config: Config
     ) -> tuple[Sequence, LabelledTracks, Config]:
-        """Return what the stages solve: a pinhole's sequence and tracks, and whether its intrinsics may move."""
+        """Return what the stages solve: a pinhole's sequence and tracks; intrinsics are held, as the lens is theirs."""
         if self.lens.is_pinhole:
             return sequence, labelled, config
         held = config.input.model_copy(update={"intrinsics": "fixed"})
@@ -112,4 +110,4 @@ def lens_step(
 def found_camera(arrays: Mapping[str, npt.NDArray[Any]]) -> CameraModel:
     """Return the camera of a record of :func:`lens_step`."""
     model = list(PARAMETERS)[int(arrays["model"][0])]
-    return CameraModel(Lens.of(model, arrays["parameters"]), arrays["intrinsics"], is_found=True)
+    return CameraModel(Lens.of(model, arrays["parameters"]), arrays["intrinsics"])

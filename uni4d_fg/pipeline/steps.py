@@ -303,10 +303,10 @@ def frozen_cameras(scene: Arrays) -> tuple[Cameras, StaticNoise]:
     return Cameras(scene["world_T_cam"], scene["intrinsics"], log_scale), StaticNoise(pixel, relative)
 
 
-def stop_if_cancelled(solves: list[SolveSummary]) -> None:
-    """Raise what ends a run whose last solve was cancelled."""
+def stop_if_cancelled(solves: list[SolveSummary], message: str = STOPPED) -> None:
+    """Raise what ends a run in which a solve was cancelled."""
     if any(solve.termination is Termination.CANCELLED for solve in solves):
-        raise Cancelled(STOPPED)
+        raise Cancelled(message)
 
 
 def _listed(frames: tuple[int, ...]) -> str:

@@ -18,10 +18,9 @@ from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.optim.added_factors import AddingRunner
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
-from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.pipeline.fingerprint import stage_key
 from uni4d_fg.pipeline.rigid import NOT_IN_WINDOWS
-from uni4d_fg.pipeline.steps import Arrays, bundle_summary, given_poses, nonrigid_step
+from uni4d_fg.pipeline.steps import Arrays, bundle_summary, given_poses, nonrigid_step, stop_if_cancelled
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.progress import Reporter
@@ -42,6 +41,8 @@ from uni4d_fg.slam.windows.scene import (
     place,
     solve_scene,
 )
+
+_STOPPED = "stopped; finished windows are kept, --resume continues from them"
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
                 tracks_in(labelled, window.frames), window, intrinsics, intrinsics, initial, config, hooks,
                 windowed.run, timestamps=windowed.sequence.timestamps,
             )  # fmt: skip
-            _stop_if_cancelled(done)
+            stop_if_cancelled(done, _STOPPED)
             return StageRecord(scene.arrays(), {"solves": [solve_dict(s) for s in done], "dropped": lost})
 
         found = windowed.record("scene", window, key, compute)
@@ -161,7 +162,7 @@ def _calibration(
 
     def compute() -> StageRecord:
         found, covariance, solves = calibrate(windowed.labelled, given, frames, config, hooks, windowed.run)
-        _stop_if_cancelled(solves)
+        stop_if_cancelled(solves, _STOPPED)
         return StageRecord({"intrinsics": found, "covariance": covariance}, {"solves": [solve_dict(s) for s in solves]})
 
     key = stage_key(key, "calibration")
@@ -248,8 +249,3 @@ def _joined_summary(arrays: Arrays, summaries: list[dict[str, Any]]) -> dict[str
     if warnings:
         out["warnings"] = list(warnings)
     return out
-
-
-def _stop_if_cancelled(solves: list[SolveSummary]) -> None:
-    if any(solve.termination is Termination.CANCELLED for solve in solves):
-        raise Cancelled("stopped; finished windows are kept, --resume continues from them")

@@ -128,9 +128,12 @@ def test_every_coloring_covers_everything_and_says_what_it_means(finished_run: P
 def test_the_worst_landmark_is_the_brightest_and_bridged_points_are_marked(finished_run: Path) -> None:
     run = opened(finished_run)
     values = values_of(run)
-    colors = Coloring(ColorBy.residual, run, values).landmarks().sum(axis=1)
-    # Sums of three rounded channels: the map of colors may step back by one each.
-    assert colors[np.argmax(values.landmark_error)] + 3 >= colors.max() > colors[np.argmin(values.landmark_error)] + 3
+    colors = Coloring(ColorBy.residual, run, values).landmarks()
+    low, high = value_range(values.landmark_error)
+    brightest = value_colors(np.array([high]), (low, high))[0]
+    worst, best = np.argmax(values.landmark_error), np.argmin(values.landmark_error)
+    np.testing.assert_array_equal(colors[worst], brightest)
+    assert colors[worst].sum() > colors[best].sum()
     observed = run.reconstruction.dynamic_observed.copy()
     observed[0, 4] = False
     bridged = run.with_parts(reconstruction=replace(run.reconstruction, dynamic_observed=observed))
