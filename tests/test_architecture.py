@@ -16,7 +16,7 @@ import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGE = CHECKOUT / "uni4d_fg"
-ROOT_MODULES = {"arrays", "errors", "files", "optional", "progress", "reading"}
+ROOT_MODULES = {"arrays", "counted", "errors", "files", "optional", "progress", "reading"}
 WINGS = ("geometry", "config", "factors", "optim", "frontend", "slam", "cues", "results", "pipeline", "cli")
 MAX_LINES = 500
 

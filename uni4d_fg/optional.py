@@ -59,6 +59,16 @@ def import_rerun() -> Any:
     return _import_extra("rerun", "export", "the format rrd needs")
 
 
+def import_pooch() -> Any:
+    """Return ``pooch``, which downloads files. Raises MissingDependencyError."""
+    return _import_extra("pooch", "models", "fetching a model needs")
+
+
+def import_distributed() -> Any:
+    """Return Dask's ``distributed``, which runs tasks in other processes. Raises MissingDependencyError."""
+    return _import_extra("distributed", "cluster", "worker processes need")
+
+
 def import_open3d() -> Any:
     """Import Open3D when it is first needed.
 

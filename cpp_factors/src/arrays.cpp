@@ -108,6 +108,7 @@ std::int64_t View<T>::size() const {
   return size;
 }
 template struct View<double>;
+template struct View<float>;
 template struct View<std::int64_t>;
 
 View<double> expect_floats(const AnyArray& array, const char* name, const Shape& shape, bool finite) {
@@ -128,6 +129,10 @@ View<double> expect_floats(const AnyArray& array, const char* name, const Shape&
     }
   }
   return view;
+}
+
+View<float> expect_singles(const AnyArray& array, const char* name, const Shape& shape) {
+  return expect<float>(array, name, shape, "float32");
 }
 
 View<std::int64_t> expect_integers(const AnyArray& array, const char* name, const Shape& shape) {

@@ -58,6 +58,9 @@ std::size_t num_axes(const AnyArray& array, const char* name);
 /// Raises ValueError "name: expected float64 (N, 2) C-contiguous, got float32 (5, 2)".
 View<double> expect_floats(const AnyArray& array, const char* name, const Shape& shape, bool finite = true);
 
+/// Check dtype float32, C-contiguity and shape; values may be anything.
+View<float> expect_singles(const AnyArray& array, const char* name, const Shape& shape);
+
 /// Check dtype int64, C-contiguity and shape.
 View<std::int64_t> expect_integers(const AnyArray& array, const char* name, const Shape& shape);
 

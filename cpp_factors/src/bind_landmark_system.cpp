@@ -51,6 +51,15 @@ void read_columns(const AnyArray& array, LandmarkProblem& problem) {
 }
 
 class BoundLandmarkSystem {
+  /// Call f with the system while no other thread does: calls share scratch memory. The interpreter's lock is released
+  /// first, so that who holds one of the two never waits for the other.
+  template <typename F>
+  auto alone(F f) {
+    nb::gil_scoped_release release;
+    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
+    return f(*system_);
+  }
+
  public:
   BoundLandmarkSystem(const std::vector<BatchArguments>& reprojection, const std::vector<BatchArguments>& depth,
                       std::int64_t num_frames, const AnyArray& landmark_free, const AnyArray& columns,
@@ -86,14 +95,10 @@ class BoundLandmarkSystem {
   }
 
   nb::object energies(const AnyArray& world_T_cam, const AnyArray& intrinsics, const AnyArray& log_scale,
-                      const AnyArray& landmarks) const {
+                      const AnyArray& landmarks) {
     const LandmarkState state = read_state(world_T_cam, intrinsics, log_scale, landmarks);
     NewArray out({static_cast<std::size_t>(system_->num_batches())});
-    {
-      nb::gil_scoped_release release;
-      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-      system_->energies(state, out.data());
-    }
+    alone([&](LandmarkSystem& system) { system.energies(state, out.data()); });
     return nb::cast(out.release());
   }
 
@@ -101,60 +106,71 @@ class BoundLandmarkSystem {
                       const AnyArray& landmarks) {
     const LandmarkState state = read_state(world_T_cam, intrinsics, log_scale, landmarks);
     NewSystem out(system_->problem());
-    LinearizeResult result;
-    {
-      nb::gil_scoped_release release;
-      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-      result = system_->linearize(state, out.view());
-    }
+    const LinearizeResult result = alone([&](LandmarkSystem& system) { return system.linearize(state, out.view()); });
     return nb::make_tuple(out.core.release(), out.border.release(), out.corner.release(), out.gradient.release(),
                           result.landmark_gradient_max, result.finite);
   }
 
-  nb::tuple landmark_blocks() const {
-    expect_linearized();
+  nb::tuple landmark_blocks() {
     const auto count = static_cast<std::size_t>(system_->problem().num_landmarks);
     NewArray blocks({count, 3, 3}), gradients({count, 3});
-    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-    system_->landmark_blocks(blocks.data(), gradients.data());
+    alone([&](LandmarkSystem& system) {
+      expect_linearized(system);
+      system.landmark_blocks(blocks.data(), gradients.data());
+    });
     return nb::make_tuple(blocks.release(), gradients.release());
   }
 
   double add_to_landmarks(const AnyArray& rows, const AnyArray& blocks, const AnyArray& gradients) {
-    expect_linearized();
+    alone(expect_linearized);
     const auto landmarks = expect_free_landmarks(rows);
     const double* block_data = expect_floats(blocks, "blocks", {landmarks.rows(), 3, 3}).data;
     const double* gradient_data = expect_floats(gradients, "gradients", {landmarks.rows(), 3}).data;
-    nb::gil_scoped_release release;
-    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-    return system_->add_to_landmarks(landmarks.rows(), landmarks.data, block_data, gradient_data);
+    return alone([&](LandmarkSystem& system) {
+      expect_linearized(system);
+      return system.add_to_landmarks(landmarks.rows(), landmarks.data, block_data, gradient_data);
+    });
+  }
+
+  void add_to_coupling(const AnyArray& frames, const AnyArray& rows, const AnyArray& blocks) {
+    alone(expect_linearized);
+    const auto landmarks = expect_free_landmarks(rows);
+    const auto seen_by = expect_rows(frames, "frames", landmarks.rows(), system_->problem().num_frames);
+    const double* data = expect_floats(blocks, "blocks", {landmarks.rows(), 3, kFrameColumns}).data;
+    alone([&](LandmarkSystem& system) {
+      expect_linearized(system);
+      system.add_to_coupling(landmarks.rows(), seen_by.data, landmarks.data, data);
+    });
   }
 
   nb::object whitened_coupling(const AnyArray& rows) {
-    if (!system_->reduced()) refuse("whitened_coupling: call reduce first");
+    const char* name = "whitened_coupling";
+    alone([&](LandmarkSystem& system) { expect_reduced(system, name); });
     const auto landmarks = expect_free_landmarks(rows);
     const auto width = static_cast<std::size_t>(system_->problem().num_columns) + kBorder + 1;
     NewArray out({static_cast<std::size_t>(landmarks.rows()), 3, width});
-    {
-      nb::gil_scoped_release release;
-      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-      system_->whitened_coupling(landmarks.rows(), landmarks.data, out.data());
-    }
+    alone([&](LandmarkSystem& system) {
+      expect_reduced(system, name);
+      system.whitened_coupling(landmarks.rows(), landmarks.data, out.data());
+    });
     return nb::cast(out.release());
   }
 
-  nb::object inverse_factors(const AnyArray& rows) const {
-    if (!system_->reduced()) refuse("inverse_factors: call reduce first");
+  nb::object inverse_factors(const AnyArray& rows) {
+    const char* name = "inverse_factors";
+    alone([&](LandmarkSystem& system) { expect_reduced(system, name); });
     const auto landmarks = expect_free_landmarks(rows);
     NewArray out({static_cast<std::size_t>(landmarks.rows()), 3, 3});
-    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-    system_->inverse_factors(landmarks.rows(), landmarks.data, out.data());
+    alone([&](LandmarkSystem& system) {
+      expect_reduced(system, name);
+      system.inverse_factors(landmarks.rows(), landmarks.data, out.data());
+    });
     return nb::cast(out.release());
   }
 
   nb::object reduce(double damping, double min_diagonal, double max_diagonal, const AnyArray& core,
                     const AnyArray& border, const AnyArray& corner, const AnyArray& gradient) {
-    expect_linearized();
+    alone(expect_linearized);
     if (!std::isfinite(damping) || damping < 0.0)
       refuse("damping: expected a finite number that is not negative, got " + std::to_string(damping));
     if (!(min_diagonal >= 0.0) || !(max_diagonal >= min_diagonal))
@@ -170,28 +186,25 @@ class BoundLandmarkSystem {
                                read(corner, "corner", {kBorder, kBorder}),
                                read(gradient, "gradient", {size + kBorder})};
     NewSystem out(problem);
-    bool positive = false;
-    {
-      nb::gil_scoped_release release;
-      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-      positive = system_->reduce({damping, min_diagonal, max_diagonal}, hessian, out.view());
-    }
+    const bool positive = alone([&](LandmarkSystem& system) {
+      expect_linearized(system);
+      return system.reduce({damping, min_diagonal, max_diagonal}, hessian, out.view());
+    });
     if (!positive) return nb::none();
     return nb::make_tuple(out.core.release(), out.border.release(), out.corner.release(), out.gradient.release());
   }
 
-  nb::tuple back_substitute(const AnyArray& camera_step, const std::optional<AnyArray>& extra) const {
-    if (!system_->reduced()) refuse("back_substitute: call reduce first");
+  nb::tuple back_substitute(const AnyArray& camera_step, const std::optional<AnyArray>& extra) {
+    const char* name = "back_substitute";
+    alone([&](LandmarkSystem& system) { expect_reduced(system, name); });
     const LandmarkProblem& problem = system_->problem();
     const auto step = expect_floats(camera_step, "camera_step", {problem.num_columns + kBorder}, false);
     const double* extra_data = extra ? expect_floats(*extra, "extra", {problem.num_landmarks, 3}, false).data : nullptr;
     NewArray out({static_cast<std::size_t>(problem.num_landmarks), 3});
-    StepSums sums;
-    {
-      nb::gil_scoped_release release;
-      const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-      sums = system_->back_substitute(step.data, extra_data, out.data());
-    }
+    const StepSums sums = alone([&](LandmarkSystem& system) {
+      expect_reduced(system, name);
+      return system.back_substitute(step.data, extra_data, out.data());
+    });
     return nb::make_tuple(out.release(), sums.slope, sums.damped, sums.squared);
   }
 
@@ -229,14 +242,16 @@ class BoundLandmarkSystem {
     return view;
   }
 
-  void expect_linearized() const {
-    if (!system_->linearized()) refuse("call linearize first");
+  static void expect_linearized(const LandmarkSystem& system) {
+    if (!system.linearized()) refuse("call linearize first");
+  }
+
+  static void expect_reduced(const LandmarkSystem& system, const char* name) {
+    if (!system.reduced()) refuse(std::string(name) + ": call reduce first");
   }
 
   std::unique_ptr<LandmarkSystem> system_;
-  /// Calls share scratch memory. Taken where the interpreter's lock is released, or for a moment while it is held: who
-  /// holds this one never waits for that one.
-  mutable std::mutex mutex_;
+  std::mutex mutex_;
 };
 
 }  // namespace
@@ -262,6 +277,11 @@ void bind_landmark_system(nb::module_& module) {
            nb::arg("gradients"),
            "Add what other factors give to free landmarks rows (n,): V += blocks (n, 3, 3) and g += gradients (n, 3), "
            "whitened and with their kernels, after linearize and before reduce. Return the largest landmark gradient.")
+      .def("add_to_coupling", &BoundLandmarkSystem::add_to_coupling, nb::arg("frames"), nb::arg("rows"),
+           nb::arg("blocks"),
+           "Add what other factors couple free landmarks rows (n,) with frames (n,) by: blocks (n, 3, 7) J_l^T J with "
+           "pose and log-scale, after linearize and before reduce, only where a factor given to the constructor, be "
+           "its weight 0, reads both.")
       .def("reduce", &BoundLandmarkSystem::reduce, nb::arg("damping"), nb::arg("min_diagonal"), nb::arg("max_diagonal"),
            nb::arg("core"), nb::arg("border"), nb::arg("corner"), nb::arg("gradient"),
            "Return the reduced core, border, corner and right-hand side, or None if a landmark is not determined.")

@@ -30,7 +30,8 @@ constexpr int kMostColumns = 1 << 14;
 
 void bind_pair_system(nb::module_& module) {
   nb::class_<PairSystem>(module, "PairSystem",
-                         "Depth reprojection factors of frame pairs with shared intrinsics: energy, Hessian, gradient.")
+                         "Depth reprojection factors of frame pairs with shared intrinsics: energy, Hessian, gradient. "
+                         "Nothing changes after the constructor: any number of threads may call.")
       .def(
           "__init__",
           [](PairSystem* self, const AnyArray& source, const AnyArray& target, const AnyArray& uv_source,

@@ -1,6 +1,8 @@
 // What a LandmarkSystem takes from, and tells, factors of types that it does not know.
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
+#include <string>
 
 #include "landmark_cholesky.hpp"
 #include "landmark_passes.hpp"
@@ -62,6 +64,28 @@ void LandmarkSystem::index_pairs() {
         pairs_of_landmark_[static_cast<std::size_t>(pairs_end_[row]++)] = {chunk.first_pair + i, chunk.frames[f]};
       }
   }
+}
+
+void LandmarkSystem::add_to_coupling(std::int64_t count, const std::int64_t* frames, const std::int64_t* rows,
+                                     const double* blocks) {
+  if (pairs_begin_.empty()) index_pairs();
+  std::vector<double*> places(static_cast<std::size_t>(count));
+  for (std::size_t i = 0; i < places.size(); ++i) {
+    const auto row = static_cast<std::size_t>(rows[i]);
+    const auto begin = pairs_of_landmark_.begin() + pairs_begin_[row],
+               end = pairs_of_landmark_.begin() + pairs_end_[row];
+    const auto found = std::lower_bound(
+        begin, end, frames[i], [](const LandmarkPair& pair, std::int64_t frame) { return pair.frame < frame; });
+    if (found == end || found->frame != frames[i])
+      throw std::invalid_argument("entry " + std::to_string(i) + ": no factor of the problem reads landmark " +
+                                  std::to_string(rows[i]) + " and frame " + std::to_string(frames[i]));
+    places[i] = coupling_.data() + found->pair * kWidth;
+  }
+  reduced_ = false;
+  const double* block = blocks;
+  for (double* place : places)
+    for (int j = 0; j < 3; ++j)
+      for (int k = 0; k < kFrameColumns; ++k) place[j * kSimd8Width + k] += *block++;
 }
 
 void LandmarkSystem::whitened_coupling(std::int64_t count, const std::int64_t* rows, double* out) {

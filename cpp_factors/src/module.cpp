@@ -8,6 +8,8 @@ void bind_whitening(nb::module_& module);
 void bind_pair_system(nb::module_& module);
 void bind_landmark_system(nb::module_& module);
 void bind_trajectory_system(nb::module_& module);
+void bind_patch_registration(nb::module_& module);
+void bind_plane_sweep(nb::module_& module);
 }  // namespace uni4d_fg
 
 NB_MODULE(_core, module) {
@@ -21,4 +23,6 @@ NB_MODULE(_core, module) {
   uni4d_fg::bind_pair_system(module);
   uni4d_fg::bind_landmark_system(module);
   uni4d_fg::bind_trajectory_system(module);
+  uni4d_fg::bind_patch_registration(module);
+  uni4d_fg::bind_plane_sweep(module);
 }

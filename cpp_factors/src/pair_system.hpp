@@ -26,6 +26,7 @@ struct PairRows {
 ///
 /// All factors of a pair share the relative pose, and J_source = -J_target Ad(target_T_source): a factor adds only to
 /// one 10x10 block (target twist, intrinsics) of its pair, which is spread over both poses once per pair.
+/// Nothing changes after the constructor, so that threads may share a system without a lock.
 class PairSystem {
  public:
   /// `pose_columns` (num_poses, 6) and `intrinsics_columns` (4,): position of an entry in the dense system of `size`

@@ -52,6 +52,25 @@ ENTRY_POINTS["whiten"] = EntryPoint(
 )
 
 
+def _patches(rng: np.random.Generator) -> dict[str, Any]:
+    return {
+        "rows": np.arange(5),
+        "image": rng.uniform(0, 255, (30, 40)),
+        "warp": np.concatenate([rng.uniform(10, 20, (5, 2)), np.tile([1.0, 0, 0, 1], (5, 1))], axis=1),
+        "weight": np.ones((7, 7)),
+        "stiffness": 2.0,
+        "max_iterations": 4,
+        "convergence_px": 0.01,
+    }
+
+
+ENTRY_POINTS["register_patches"] = EntryPoint(
+    lambda **a: _core.register_patches(np.random.default_rng(0).uniform(0, 255, (5, 9, 9)).astype(np.float32), **a),
+    _patches,
+    ("weight",),
+)
+
+
 def _pairs(rng: np.random.Generator) -> dict[str, Any]:
     return {
         "source": np.array([0, 0, 1, 2, 2]),

@@ -33,7 +33,10 @@ def arguments_of(name: str, rng: np.random.Generator, count: int) -> Arguments:
     def poses() -> np.ndarray:
         return se3.se3_exp(rng.normal(size=(count, 6)) * np.array([0.4, 0.4, 0.4, 1.0, 1.0, 1.0]))
 
-    by_name = {"floor": lambda: rng.uniform(1e-4, 1e-2, count), "intrinsics": intrinsics}
+    def cameras() -> np.ndarray:
+        return np.concatenate([intrinsics(), rng.normal(size=(count, 4)) * 0.1], axis=1)
+
+    by_name = {"camera": cameras, "floor": lambda: rng.uniform(1e-4, 1e-2, count), "intrinsics": intrinsics}
     by_shape = {
         (4, 4): poses,
         (3,): lambda: rng.normal(size=(count, 3)) * 2.0 + np.array([0.0, 0.0, 3.0]),

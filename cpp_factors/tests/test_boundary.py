@@ -84,7 +84,7 @@ def test_malformed_arrays_are_refused_by_name(name: str, data: st.DataObject, se
     argument = data.draw(st.sampled_from(arrays))
     arguments[argument], kind = spoil(arguments[argument], data, argument in entry.negative)
     # Arrays of one length stand together: when one differs, either may be called wrong; a free axis may be any.
-    if kind == "length" or (kind == "shape" and argument in ("residual", "jacobians")):
+    if kind == "length" or (kind == "shape" and argument in ("residual", "jacobians", "image")):
         message = refusal(entry.call, arguments)
         assert message is None or any(n in message for n in arrays)
         return

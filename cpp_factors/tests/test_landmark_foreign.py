@@ -294,6 +294,31 @@ def test_an_asymmetric_block_counts_with_its_symmetric_part() -> None:
     np.testing.assert_allclose((system.landmark_blocks()[0] - before)[4], 0.5 * (block + block.T), atol=1e-10)
 
 
+def test_couplings_go_to_the_frames_that_a_landmark_has() -> None:
+    scene = make_scene(5, 8, 30, 3, intrinsics="free")
+    system = make_system(scene, scene.size, banded=False, threads=1)
+    one, frames = np.array([6]), scene.pose[scene.landmark == 6]
+    system.reduce(DAMPING, *BOUNDS, *system.linearize(**scene.state)[:4])
+    before, factor = system.whitened_coupling(one)[0], system.inverse_factors(one)[0]
+    arrays = system.linearize(**scene.state)[:4]
+    block = np.arange(21.0).reshape(1, 3, 7)
+    system.add_to_coupling(np.repeat(frames[1], 2), np.repeat(one, 2), np.repeat(block, 2, axis=0))
+    with pytest.raises(ValueError, match="call reduce first"):
+        system.whitened_coupling(one)
+    system.reduce(DAMPING, *BOUNDS, *arrays)
+    expected = np.zeros_like(before)
+    columns = scene.columns[frames[1]]
+    expected[:, columns[columns >= 0]] = 2.0 * factor @ block[0][:, columns >= 0]
+    np.testing.assert_allclose(system.whitened_coupling(one)[0] - before, expected, atol=1e-9)
+    elsewhere = np.setdiff1d(np.arange(scene.frames), frames)[:1]
+    with pytest.raises(ValueError, match=rf"no factor of the problem reads landmark 6 and frame {elsewhere[0]}"):
+        system.add_to_coupling(elsewhere, one, block)
+    with pytest.raises(ValueError, match=r"frames: entry 0 is 8, outside \[0, 8\)"):
+        system.add_to_coupling(np.array([8]), one, block)
+    with pytest.raises(ValueError, match=r"blocks: expected float64 \(1, 3, 7\)"):
+        system.add_to_coupling(frames[:1], one, block[:, :, :6].copy())
+
+
 def test_what_is_refused() -> None:
     scene = make_scene(2, 6, 20, 3, intrinsics="free")
     system = make_system(scene, scene.size, banded=False, threads=1)

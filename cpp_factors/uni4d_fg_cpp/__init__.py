@@ -2,8 +2,8 @@
 
 Everything is in the compiled module ``_core``: ``factor_types`` lists the factor types that have a kernel,
 ``residual`` and ``linearize`` run one by its name, ``whiten`` and ``robust_energy`` apply noise and robust kernels,
-and the systems solve the stages. Arrays are float64 (row numbers int64) and C-contiguous; a ValueError or TypeError
-names the argument that is not.
+the systems solve the stages, ``register_patches`` finds patches in an image, and ``plane_sweep`` matches views. Arrays
+are float64 (row numbers int64) and C-contiguous; a ValueError or TypeError names the argument that is not.
 """
 
 from uni4d_fg_cpp import _core
@@ -14,6 +14,8 @@ from uni4d_fg_cpp._core import (
     TrajectorySystem,
     factor_types,
     linearize,
+    plane_sweep,
+    register_patches,
     residual,
     robust_energy,
     whiten,
@@ -27,6 +29,8 @@ __all__ = [
     "_core",
     "factor_types",
     "linearize",
+    "plane_sweep",
+    "register_patches",
     "residual",
     "robust_energy",
     "whiten",

@@ -11,8 +11,9 @@ from uni4d_fg.config.geometric_depth import AffineDepthConfig
 from uni4d_fg.cues.affine_depth import align_affine
 from uni4d_fg.cues.cache import FloatMaps, FrameCache
 from uni4d_fg.cues.network_makers import labels_are_stored, store_labels, store_maps
+from uni4d_fg.cues.packed_maps import rounded
 from uni4d_fg.errors import DegenerateProblemError, InputError
-from uni4d_fg.files import save_npy
+from uni4d_fg.files import save_npy, save_npz
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import SilentReporter
@@ -36,21 +37,23 @@ def test_a_flipped_bit_in_a_map_is_noticed_and_the_map_made_again(tmp_path: Path
     whole = first.paths[1].read_bytes()
     cache = FrameCache(tmp_path)
     for damage in (
-        lambda path: flipped(path),
+        lambda path: flipped(path, len(whole) // 2),
         lambda path: path.write_bytes(whole[:-3]),
         lambda path: path.write_bytes(b""),
     ):
         damage(first.paths[1])
         assert not cache.has_map("000001", SIZE)
         assert cache.has_map("000002", SIZE)
-        np.testing.assert_array_equal(stored()[1], maps[1])
+        np.testing.assert_array_equal(stored()[1], rounded(maps[1]))
         assert first.paths[1].read_bytes() == whole
-    np.testing.assert_array_equal(np.load(first.paths[1]), maps[1])
-    flipped(first.paths[0])
-    with pytest.raises(InputError, match=r"000000\.npy: is damaged, its checksum does not fit"):
+    flipped(first.paths[0], len(whole) // 2)
+    with pytest.raises(InputError, match=r"000000\.map\.npz: not a readable"):
         first[0]
-    save_npy(first.paths[2], maps[2])
+    np.testing.assert_array_equal(first[2], rounded(maps[2]))
+    save_npz(first.paths[2], planes=np.zeros((2, *SIZE), np.uint8))
     assert not cache.has_map("000002", SIZE)
+    save_npy(tmp_path / "old.npy", maps[0])
+    np.testing.assert_array_equal(FloatMaps((tmp_path / "old.npy",), SIZE)[0], maps[0])
 
 
 def test_damaged_masks_are_made_again(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -244,12 +244,12 @@ def test_a_folder_that_does_not_fit_is_one_clear_error(tmp_path: Path) -> None:
         opened(tmp_path / "absent")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    with pytest.raises(InputError, match=r"not a known form of masks: .* holds a/, b/"):
+    with pytest.raises(InputError, match=r"holds no masks that can be read: .* holds a/, b/"):
         opened(tmp_path)
     with pytest.raises(InputError, match="holds no masks"):
         opened(tmp_path / "a")
     (tmp_path / "x.txt").write_text("no masks")
-    with pytest.raises(InputError, match="not a known form of masks"):
+    with pytest.raises(InputError, match="holds no masks that can be read"):
         opened(tmp_path / "x.txt")
     for t in range(3):
         save_palette(tmp_path / "a" / f"{t:05d}.png", np.zeros((4, 4)))

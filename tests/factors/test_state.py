@@ -66,8 +66,8 @@ def test_a_state_is_read_from_values_alone(state: State) -> None:
         np.testing.assert_array_equal(back.numbers(variable), state.numbers(variable))
         assert back.keys(variable) == state.keys(variable)
     values = state.to_values()
-    values.insert(gtsam.symbol("z", 3), np.zeros(2))
-    with pytest.raises(ValueError, match=r"\(z3\) is of no declared variable type"):
+    values.insert(gtsam.symbol("j", 3), np.zeros(2))
+    with pytest.raises(ValueError, match=r"\(j3\) is of no declared variable type"):
         State.from_values(values)
 
 
@@ -123,7 +123,7 @@ def test_keys_of_all_rows_are_distinct(state: State) -> None:
 def test_rows_are_found_by_key(state: State) -> None:
     places = [(DYNAMIC_POINT, 4), (POSE, 0), (LANDMARK, 4), (POSE, 3), (IMU_BIAS, 1)]
     assert state.rows_of([state.key(variable, row) for variable, row in places]) == places
-    for missing in (LANDMARK.key(4), gtsam.symbol("z", 0), DYNAMIC_POINT.key(1, 2)):
+    for missing in (LANDMARK.key(4), gtsam.symbol("j", 0), DYNAMIC_POINT.key(1, 2)):
         with pytest.raises(KeyError, match=str(missing)):
             state.rows_of([POSE.key(0), missing])
 

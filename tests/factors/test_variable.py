@@ -115,7 +115,7 @@ def test_keys_survive_numpy_integers_and_gtsam_values() -> None:
         (VELOCITY.key(2), "velocity, frame 2", "v2"),
         (IMU_BIAS.key(2), "IMU bias, frame 2", "b2"),
         (42, "unknown variable 42", "42"),
-        (gtsam.symbol("z", 3), f"unknown variable {gtsam.symbol('z', 3)}", str(gtsam.symbol("z", 3))),
+        (gtsam.symbol("j", 3), f"unknown variable {gtsam.symbol('j', 3)}", str(gtsam.symbol("j", 3))),
     ],
 )
 def test_keys_read_as_words(key: int, text: str, short: str) -> None:

@@ -69,6 +69,13 @@ def test_calibrations_in_memory(
     )
 
 
+def test_the_error_does_not_hold_the_array(sequence_folder: Path, tmp_path: Path) -> None:
+    for shape in ((60, 60, 0), (2, 2), (5,)):
+        sequence = dataclasses.replace(read_sequence(sequence_folder), intrinsics=np.ones(shape))
+        error = judged(reconstruct, sequence, tmp_path / "run", load_config("fast"))
+        assert f"intrinsics of shape {shape} are not fx, fy" in str(error)
+
+
 def scenes(sequence: Sequence) -> dict[str, dict[str, Any]]:
     images, depths, masks = (frames_of(sequence, name) for name in ("images", "depths", "masks"))
     rng = np.random.default_rng(0)

@@ -113,6 +113,15 @@ def test_an_image_of_too_many_pixels(tmp_path: Path) -> None:
         assert isinstance(judged(read, tmp_path / "a.png"), InputError)
 
 
+@pytest.mark.parametrize("before", [b"IDAT", b"IEND"])
+def test_a_chunk_that_announces_more_than_the_file_has(tmp_path: Path, before: bytes) -> None:
+    whole = cv2.imencode(".png", np.zeros((60, 80), np.uint8))[1].tobytes()
+    at = whole.index(before) - 4
+    (tmp_path / "a.png").write_bytes(whole[:at] + b"\x7f\xff\xff\xfftEXt" + whole[at:])
+    for read in (read_image, read_mask, read_depth):
+        assert "a.png: is cut short or damaged" in str(judged(read, tmp_path / "a.png"))
+
+
 @hostile
 @given(data=st.data())
 def test_videos(video_file: Path, data: st.DataObject) -> None:

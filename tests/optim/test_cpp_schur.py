@@ -15,6 +15,7 @@ from uni4d_fg.errors import SolverError
 from uni4d_fg.factors import FactorBatch, FactorType, Kernel, Slot, VariableType
 from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
 from uni4d_fg.factors.depth_prior import static_depth_prior
+from uni4d_fg.factors.lens_reprojection import fisheye_reprojection, opencv_reprojection
 from uni4d_fg.factors.priors import intrinsics_prior, log_scale_prior, scale_anchor
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.static_reprojection import static_reprojection
@@ -192,6 +193,20 @@ def moving_points(rng: np.random.Generator) -> Sample:
     return replace(problem, batches=(*problem.batches, tie, prior), free=free), state
 
 
+def through_a_lens(sample: Sample, kind: FactorType) -> Sample:
+    """Every observation through a lens, whose second parameter is held at zero."""
+    problem, state = sample
+    variable, free = kind.variables[2], dict(problem.free)
+    arrays = {v: array for v, array in state.arrays.items() if v is not INTRINSICS}
+    camera = np.concatenate([state[INTRINSICS], [[-0.1, 0.0, 1e-3, -1e-3]]], axis=1)
+    del free[INTRINSICS]
+    free[variable] = np.array([[True] * 5 + [False] + [True] * 2])
+    first, *others = (b for b in problem.batches if b.factor_type is not intrinsics_prior)
+    camera_slot = Slot(variable, np.zeros(len(first), dtype=np.int64))
+    lens = replace(first, factor_type=kind, slots=(*first.slots[:2], camera_slot))
+    return replace(problem, batches=(lens, *others), free=free), State({variable: camera, **arrays}, state.index)
+
+
 def kernels(kind: str) -> Callable[[np.random.Generator], Sample]:
     kernel = Kernel(kind, 0.7)  # type: ignore[arg-type]
     return lambda rng: changed(scene(rng), lambda b: replace(b, kernel=kernel))
@@ -214,6 +229,15 @@ SAMPLES: dict[str, Callable[[np.random.Generator], Sample]] = {
     "two cameras": two_cameras,
     "scales of other frames": scales_of_other_frames,
     "moving points": moving_points,
+    "polynomial lens": lambda rng: through_a_lens(scene(rng), opencv_reprojection),
+    "fisheye": lambda rng: through_a_lens(scene(rng, 9, 300), fisheye_reprojection),
+    "lens in a long sequence": lambda rng: through_a_lens(long_sequence(rng), opencv_reprojection),
+    "lens and frozen entries": lambda rng: frozen(
+        through_a_lens(scene(rng), opencv_reprojection),
+        pose=(slice(2, 4), slice(1, 5)),
+        log_scale=[1, 2],
+        landmark=slice(0, 90, 4),
+    ),
     "frozen landmarks": lambda rng: frozen(scene(rng), landmark=slice(0, 90, 4)),
     "frozen intrinsics": lambda rng: frozen(scene(rng), intrinsics=None),
     "frozen center": lambda rng: frozen(scene(rng), intrinsics=(slice(None), slice(2, 4))),
@@ -290,21 +314,13 @@ def test_band_is_used_and_agrees_with_dense_storage(rng: np.random.Generator) ->
     assert not CppSchurObjective(*scene(rng), CONFIG).columns.banded
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "depth",
-        "no depth",
-        "repeated",
-        "frozen landmarks",
-        "camera terms",
-        "long sequence",
-        "landmark prior",
-        "two cameras",
-        "scales of other frames",
-        "moving points",
-    ],
-)
+AGREE = (
+    "depth", "no depth", "repeated", "frozen landmarks", "camera terms", "long sequence", "landmark prior",
+    "two cameras", "scales of other frames", "moving points", "polynomial lens",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", AGREE)
 def test_solutions_agree(rng: np.random.Generator, name: str) -> None:
     problem, state = SAMPLES[name](rng)
     config = SolverConfig(relative_decrease=1e-13, max_iterations=300)
@@ -456,6 +472,7 @@ def test_without_poses_the_fallback_solves(rng: np.random.Generator) -> None:
         ("two cameras", ("depth_prior",), ("static_reprojection",)),
         ("scales of other frames", ("static_reprojection",), ("depth_prior",)),
         ("moving points", ("static_reprojection", "depth_prior"), ("tie",)),
+        ("fisheye", ("depth_prior",), ("static_reprojection",)),
     ],
 )
 def test_what_it_does_not_know_takes_part_linearized(

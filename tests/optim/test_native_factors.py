@@ -238,8 +238,8 @@ def test_a_factor_whose_key_the_problem_lacks_is_named(rng: np.random.Generator)
             "PriorFactorPoint3 reads dynamic point, track 17, frame 3, which the problem does not have",
         ),
         (
-            gtsam.PriorFactorPose3(gtsam.symbol("z", 0), gtsam.Pose3(np.eye(4)), noise),
-            f"PriorFactorPose3 reads unknown variable {gtsam.symbol('z', 0)}, which the problem does not have",
+            gtsam.PriorFactorPose3(gtsam.symbol("j", 0), gtsam.Pose3(np.eye(4)), noise),
+            f"PriorFactorPose3 reads unknown variable {gtsam.symbol('j', 0)}, which the problem does not have",
         ),
         (
             gtsam.PriorFactorConstantBias(IMU_BIAS.key(0), gtsam.imuBias.ConstantBias(), noise),

@@ -36,6 +36,15 @@ def print_error(message: str, kind: str = "error") -> None:
         typer.echo(text.encode("utf-8", "backslashreplace").decode("utf-8"), err=True)
 
 
+def duration(seconds: float) -> str:
+    """Return a time as a person says it: ``42.1 s``, ``3 min 7 s``, ``1 h 12 min``."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON on standard output."""
     typer.echo(json_text(value))
@@ -44,7 +53,7 @@ def print_json(value: Any) -> None:
 def validation_text(report: ValidationReport) -> str:
     """Return a validation report as a table of what is there and a list of findings."""
     lines = [f"{report.root}: {report.layout or 'unknown'} layout", ""]
-    lines += _table(("item", "count", "shape", "type", "range"), [_item_row(item) for item in report.items])
+    lines += table_lines(("item", "count", "shape", "type", "range"), [_item_row(item) for item in report.items])
     for severity in ("error", "warning", "info"):
         for finding in report.of(severity):
             lines += ["", f"{severity}: {finding.item}: {finding.message}", f"    to do: {finding.remedy}"]
@@ -58,7 +67,8 @@ def _item_row(item: ItemSummary) -> tuple[str, ...]:
     return item.name, str(item.count), " x ".join(map(str, item.shape)) or "-", item.dtype or "-", limits
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+def table_lines(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    """Return a table as aligned lines; none without rows."""
     if not rows:
         return []
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]

@@ -22,6 +22,8 @@ _EXTRAS = {
     "view": ("viser", "the interactive view"),
     "export": ("rerun", "rerun files (.rrd)"),
     "adam": ("torch", "comparison with Adam"),
+    "models": ("pooch", "fetching published networks"),
+    "cluster": ("distributed", "benchmarks on several processes and machines"),
 }
 """Extra to a module of it, and what it is for."""
 

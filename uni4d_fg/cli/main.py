@@ -5,16 +5,19 @@ from __future__ import annotations
 import sys
 import traceback
 from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from uni4d_fg.cli import (
+    benchmark,
     comparison,
     cues,
     doctor,
     exports,
+    films,
     graphs,
+    models,
     reconstruction,
     results,
     sequences,
@@ -37,10 +40,11 @@ app = typer.Typer(
 for verb in (
     reconstruction.demo, doctor.doctor, sequences.validate, sequences.track, cues.cues, reconstruction.reconstruct,
     streaming.stream,
-    results.evaluate, exports.export, graphs.graph, viewing.view, viewing.report,
-    comparison.compare, sequences.synthesize, results.config,
+    results.evaluate, exports.export, graphs.graph, viewing.view, viewing.share, films.render, viewing.report,
+    comparison.compare, benchmark.benchmark, benchmark.ablate, sequences.synthesize, results.config,
 ):  # fmt: skip
     app.command()(verb)
+app.add_typer(models.app, name="models")
 
 
 def _show_version(wanted: bool) -> None:
@@ -64,11 +68,24 @@ def options(
     log_to_stderr(verbose)
 
 
+def _tidy_help(command: Any) -> None:
+    """Tidy the help of a command and of those below it: flags have no type, paragraphs no line breaks."""
+    if command.help:
+        command.help = "\n\n".join(" ".join(part.split()) for part in command.help.split("\n\n"))
+    for parameter in command.params:
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
+    for below in getattr(command, "commands", {}).values():
+        _tidy_help(below)
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code."""
     debug = "--debug" in arguments
     try:
-        app(args=[word for word in arguments if word != "--debug"], prog_name="uni4d-fg")
+        command = typer.main.get_command(app)
+        _tidy_help(command)
+        command(args=[word for word in arguments if word != "--debug"], prog_name="uni4d-fg")
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1 if stop.code else 0
     except (Exception, KeyboardInterrupt) as error:

@@ -87,7 +87,7 @@ RelativePosesFile = Annotated[
 ]
 Start = Annotated[int, typer.Option(help="First frame.")]
 Stop = Annotated[int | None, typer.Option(help="First frame that is left out.", show_default=False)]
-Stride = Annotated[int, typer.Option(help="Take every so many frames.")]
+Stride = Annotated[int, typer.Option(help="Use every N-th frame.")]
 MaxSize = Annotated[int | None, typer.Option(help="Longer side of the images at most, px.", show_default=False)]
 DepthScale = Annotated[float, typer.Option(help="Units per meter of true depth in PNGs (Uni4D's layout).")]
 KnownIntrinsics = Annotated[

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
-from uni4d_fg.cli.console import STDERR
+from uni4d_fg.cli.console import STDERR, duration
+from uni4d_fg.cli.forecast import Forecast, ForecastReporter
 from uni4d_fg.progress import Reporter, SilentReporter
 
 
@@ -44,9 +45,14 @@ class RichReporter:
 
 
 class LineReporter:
-    """Prints one line when a task ends; for log files and pipes."""
+    """Prints one line when a task ends; for log files and pipes.
 
-    def __init__(self) -> None:
+    Args:
+        left: Says how long the whole run will still take; may be empty.
+    """
+
+    def __init__(self, left: Callable[[], str] = lambda: "") -> None:
+        self._left = left
         self._task: str | None = None
         self._began = 0.0
 
@@ -62,18 +68,24 @@ class LineReporter:
     def end(self, text: str = "") -> None:
         """Print the task with the time it took."""
         if self._task is not None:
-            more = f", {text}" if text else ""
+            more = "".join(f", {said}" for said in (text, self._left()) if said)
             typer.echo(f"{self._task}: {time.perf_counter() - self._began:.1f} s{more}", err=True)
         self._task = None
 
 
 @contextmanager
-def progress_reporter(quiet: bool) -> Iterator[Reporter]:
-    """Give the reporter that fits the terminal; the bars are closed at the end."""
+def progress_reporter(quiet: bool, forecast: Forecast | None = None) -> Iterator[Reporter]:
+    """Give the reporter that fits the terminal; the bars are closed at the end.
+
+    Args:
+        quiet: Say nothing.
+        forecast: Of the whole run, which may have other parts before and behind; shown as a bar of its own, or with
+            the line of every task.
+    """
     if quiet:
         yield SilentReporter()
     elif not sys.stderr.isatty():
-        yield LineReporter()
+        yield LineReporter() if forecast is None else ForecastReporter(LineReporter(lambda: left(forecast)), forecast)
     else:
         columns = (
             SpinnerColumn(finished_text=" "),
@@ -83,4 +95,19 @@ def progress_reporter(quiet: bool) -> Iterator[Reporter]:
             TextColumn("{task.fields[text]}", markup=False, style="dim"),
         )
         with Progress(*columns, console=STDERR) as progress:
-            yield RichReporter(progress)
+            if forecast is None:
+                yield RichReporter(progress)
+                return
+            whole = progress.add_task("whole run", total=1.0, text="")
+
+            def show() -> None:
+                progress.update(whole, completed=forecast.state()[0], text=left(forecast))
+
+            show()
+            yield ForecastReporter(RichReporter(progress), forecast, show)
+
+
+def left(forecast: Forecast) -> str:
+    """Return the time that is left in words; empty while nobody can know."""
+    _, seconds = forecast.state()
+    return "" if seconds is None else f"about {duration(seconds)} left"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uni4d_fg.cli import options
-from uni4d_fg.cli.console import print_json
+from uni4d_fg.cli.console import duration, print_json
+from uni4d_fg.cli.forecast import Forecast, expected_shares
 from uni4d_fg.cli.interruption import Interruption, resume_command
 from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
@@ -74,6 +77,7 @@ def reconstruct(
     from uni4d_fg.pipeline.measurements import MeasurementFiles
     from uni4d_fg.slam.windows.plan import windows_of
 
+    began = time.perf_counter()
     chosen = [] if solver is None else [f"solver={solver.value}"]
     chosen += [] if window is None else [f"windows.frames={window}"]
     chosen += [] if overlap is None else [f"windows.overlap={overlap}"]
@@ -95,11 +99,14 @@ def reconstruct(
     is_measured = any(given is not None for given in (imu, odometry, gps, relative_poses))
 
     def solve(video: Video, folder: Path, again: bool, warnings: tuple[str, ...] = ()) -> tuple[RunSummary, Sequence]:
-        sequence, report = run_cues(video, plan, folder, settings, quiet=quiet)
+        forecast = Forecast(
+            expected_shares(video.num_frames, video.image_size, settings, plan, has_tracks=video.tracks is not None)
+        )
+        sequence, report = run_cues(video, plan, folder, settings, quiet=quiet, forecast=forecast)
         chosen = settings if report is None or report.settings is None else report.settings
         return run_pipeline(
             sequence, folder, chosen, resume=again, quiet=quiet, cues=report, measurements=files, imu=samples,
-            warnings=warnings,
+            warnings=warnings, forecast=forecast,
         ), sequence  # fmt: skip
 
     with run_lock(run):
@@ -122,7 +129,18 @@ def reconstruct(
     if json:
         print_json(summary.to_dict())
     else:
-        typer.echo("\n".join([*summary.lines(), f"results: {run}"]))
+        typer.echo("\n".join([*summary.lines(), *closing_lines(run, time.perf_counter() - began)]))
+
+
+def closing_lines(run: Path, seconds: float) -> list[str]:
+    """Return what is said at the end of a run: how long it took, where it is, how large, and what to do with it."""
+    size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
+    name = shlex.quote(str(run))
+    return [
+        f"total: {duration(seconds)}, {size / 1e6:.0f} MB on disk",
+        f"results: {run}",
+        f"next: uni4d-fg view {name} | uni4d-fg report {name} | uni4d-fg export {name} --to colmap",
+    ]
 
 
 def demo(
@@ -137,6 +155,7 @@ def demo(
     """Make a moving scene, reconstruct it, and score the result against the exact truth."""
     from uni4d_fg.cli import demonstration
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.cues.plan import CuePlan
     from uni4d_fg.results.evaluate.run import evaluate_run
 
     settings = load_config(config or ("fast" if fast else None), changes or ())
@@ -145,7 +164,10 @@ def demo(
         mark_run(out)
         source.save(out)
         sequence = source.read()
-        summary = run_pipeline(sequence, out, settings, resume=resume, quiet=quiet)
+        shares = expected_shares(
+            sequence.num_frames, sequence.image_size, settings, CuePlan(), has_tracks=sequence.tracks is not None
+        )
+        summary = run_pipeline(sequence, out, settings, resume=resume, quiet=quiet, forecast=Forecast(shares))
         report = evaluate_run(out, sequence)
     if json:
         print_json({"summary": summary.to_dict(), "evaluation": report.to_dict()})
@@ -154,7 +176,7 @@ def demo(
 
 
 def run_cues(
-    video: Video, plan: CuePlan, run: Path, config: Config, *, quiet: bool
+    video: Video, plan: CuePlan, run: Path, config: Config, *, quiet: bool, forecast: Forecast | None = None
 ) -> tuple[Sequence, CueReport | None]:
     """Make the cues that are missing, with progress, in ``RUN/cues``; None when there was nothing to make.
 
@@ -167,11 +189,13 @@ def run_cues(
     if plan.is_given:
         return as_sequence(replace(video, masks=None) if plan.masks == "none" else video), None
     folder = run / CUE_FOLDER
-    with Interruption() as stop, progress_reporter(quiet) as reporter:
+    began = time.perf_counter()
+    with Interruption() as stop, progress_reporter(quiet, forecast) as reporter:
         try:
-            return gather_cues(
+            sequence, report = gather_cues(
                 video, plan, folder, config, reporter=reporter, should_stop=stop, track_cache=run / "stages"
             )
+            return sequence, replace(report, seconds=time.perf_counter() - began)
         except Cancelled as error:
             raise Cancelled(f"{error}; what is done is in {folder}; continue with: {resume_command()}") from error
 
@@ -193,7 +217,7 @@ def class_list(classes: str | None) -> tuple[str, ...] | None:
 def run_pipeline(
     sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None,
     imu: ImuSamples | None = None,
-    measurements: MeasurementFiles | None = None, warnings: tuple[str, ...] = (),
+    measurements: MeasurementFiles | None = None, warnings: tuple[str, ...] = (), forecast: Forecast | None = None,
 ) -> RunSummary:  # fmt: skip
     """Reconstruct with progress; Ctrl-C ends the run cleanly and says how to go on.
 
@@ -202,7 +226,7 @@ def run_pipeline(
     """
     from uni4d_fg.pipeline import reconstruct as reconstruct_sequence
 
-    with Interruption() as stop, progress_reporter(quiet) as reporter:
+    with Interruption() as stop, progress_reporter(quiet, forecast) as reporter:
         try:
             return reconstruct_sequence(
                 sequence, run, config, resume=resume, reporter=reporter, should_stop=stop,

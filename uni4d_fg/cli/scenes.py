@@ -58,9 +58,60 @@ def write_scene(
     return sequence
 
 
+CUES = "cues"
+"""Folder beside the videos of a dataset that holds the cues of each, by its name."""
+
+
+def write_scene_as(scene: SyntheticSceneConfig, root: Path, dataset: str, video: str | None) -> tuple[str, int]:
+    """Make a scene and write it as one more video of a dataset, its noisy cues into ``cues/VIDEO`` beside it.
+
+    Args:
+        scene: What to make.
+        root: Folder of the dataset, made if absent.
+        dataset: A name of :data:`~uni4d_fg.frontend.datasets.writers.WRITERS`.
+        video: Its name; None takes the first of the dataset's default split that is not there.
+
+    Returns:
+        The name of the video, and how many of its frames the dataset's convention uses.
+
+    Raises:
+        ConfigError: If there is no such layout.
+        InputError: If the scene has too few frames for the dataset's convention.
+        OutputError: If the video is there already or cannot be written.
+        MissingDependencyError: If Open3D cannot be loaded.
+    """
+    from uni4d_fg.frontend.datasets.registry import find_dataset
+    from uni4d_fg.frontend.datasets.writers import WRITERS
+    from uni4d_fg.frontend.sequence.assemble import as_sequence, as_video
+    from uni4d_fg.frontend.sequence.selection import select_frames
+    from uni4d_fg.frontend.sequence.write import write_cues
+    from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
+
+    if dataset not in WRITERS:
+        raise ConfigError(f"--as {dataset}: there is no such layout; choose one of {', '.join(WRITERS)}")
+    known = find_dataset({"tum": "tum-dynamics"}.get(dataset, dataset))
+    there = known.found(root) if root.is_dir() else ()
+    names = known.card.splits[known.card.default_split] or ()
+    name = video or next((n for n in names if n not in there and not (root / CUES / n).exists()), None)
+    if name is None:
+        raise OutputError(f"{root}: all videos of {known.card.title} are there; name another with --video")
+    if name in there or (root / CUES / name).exists():
+        raise OutputError(f"{root}: the video {name} is there already; name another with --video")
+    used = known.card.selection.indices(scene.num_frames)
+    if len(used) < 2:
+        raise InputError(
+            f"--frames {scene.num_frames}: {known.card.title} uses {known.card.convention}; make more frames"
+        )
+    sequence = make_synthetic_sequence(scene)
+    WRITERS[dataset](sequence, root, name)
+    write_cues(as_sequence(select_frames(as_video(sequence), known.card.selection)), root / CUES / name)
+    atomic_write_text(root / CUES / f"{name}.yaml", dump_config(scene))
+    return name, len(used)
+
+
 _SCENE_FILES = re.compile(
     r"scene\.yaml|K\.npy|c2w\.npy|timestamps\.txt|world_T_cam_init\.npy|tracks\.npz|ground_truth\.npz"
-    r"|(depth_cue|depth_gt)\.npy|(rgb|masks|depth_cue|depth_gt)/\d+\.png"
+    r"|(depth_cue|depth_gt)\.npy|(rgb|masks|masks_gt|depth_cue|depth_gt)/\d+\.png"
 )
 
 

@@ -13,7 +13,7 @@ from uni4d_fg.cli.interruption import Interruption
 from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import SequenceInput
-from uni4d_fg.errors import InputError, OutputError
+from uni4d_fg.errors import ConfigError, InputError, OutputError
 
 if TYPE_CHECKING:
     from uni4d_fg.arrays import ImageArray
@@ -102,16 +102,35 @@ def synthesize(
     seed: Annotated[int | None, typer.Option(help="Seed of the noise.", show_default=False)] = None,
     changes: options.Overrides = None,
     layout: options.Layout = LayoutChoice.native,
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            "--as",
+            metavar="sintel|tum|bonn|kitti",
+            help="Write one more video of a dataset, in its own layout.",
+            show_default=False,
+        ),
+    ] = None,
+    video: Annotated[str | None, typer.Option(help="Name of the video, with --as.", show_default=False)] = None,
     imu: Annotated[bool, typer.Option("--imu", help="Write an accelerometer and a gyroscope too: imu.csv.")] = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Make a moving scene with exact ground truth. All fields of --set are in docs/configuration_advanced.md."""
-    from uni4d_fg.cli.scenes import scene_config, write_scene
+    from uni4d_fg.cli.scenes import scene_config, write_scene, write_scene_as
 
+    if dataset is not None and (imu or layout == LayoutChoice.uni4d):
+        raise ConfigError("--as writes the layout of a dataset, without an IMU; leave out --layout and --imu")
+    if dataset is None and video is not None:
+        raise ConfigError("--video names a video of a dataset; choose its layout with --as")
     named = {"num_frames": frames, "width": width, "height": height, "path": path, "objects": objects, "seed": seed}
     scene = scene_config(named, changes or ())
     with progress_reporter(quiet) as reporter:
         reporter.begin("synthetic scene", None)
+        if dataset is not None:
+            name, used = write_scene_as(scene, out, dataset, video)
+            reporter.end()
+            typer.echo(f"{name}: {scene.num_frames} frames of {scene.width} x {scene.height} px, {used} used: {out}")
+            return
         sequence = write_scene(scene, out, layout.value, imu=imu)
         reporter.end()
     tracks = 0 if sequence.tracks is None else sequence.tracks.num_tracks

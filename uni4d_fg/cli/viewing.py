@@ -1,29 +1,33 @@
-"""Verbs for looking at a run: ``view``, ``report``."""
+"""Verbs for looking at a run: ``view``, ``report``, ``share``."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from uni4d_fg.cli import options
+from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.results.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from uni4d_fg.results.run import Run
+
+_LOADING_ENDS_S = 5.0
 
 
 def view(
     run: options.RunPath,
     host: Annotated[str, typer.Option(help="Address to listen at; 0.0.0.0 for other machines as well.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen at.", min=1, max=65535)] = 8080,
-    max_points: Annotated[int, typer.Option(help="Points of the static cloud that are sent.", min=1)] = 400_000,
+    max_points: Annotated[int, typer.Option(help="Points of the static cloud that are sent.", min=1)] = 3_000_000,
 ) -> None:
-    """Show a run in a browser: cameras, clouds and trajectories over time."""
+    """Show a run in a browser: cameras, clouds and trajectories over time; of a run that is going on, what it has."""
     from uni4d_fg.results.view.content import Limits
     from uni4d_fg.results.view.server import viewer_server
     from uni4d_fg.results.view.viewer import Viewer
@@ -31,13 +35,20 @@ def view(
     # Ctrl-C is how a viewer is closed, so that it is no failure; a shell's background job is started deaf to it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt):
-        opened = _open(run)
+        opened = open_run(run, unfinished=True)
         with viewer_server(host, port, f"uni4d-fg: {opened.name}") as server:
             viewer = Viewer(server, opened, Limits(static_points=max_points))
             shown = f"[{host}]" if ":" in host else host
             typer.echo(f"{opened.name}: http://{shown}:{port} (Ctrl-C ends)")
             sys.stdout.flush()
-            viewer.run_until(lambda: False)
+            ended = threading.Event()
+            loading = threading.Thread(target=viewer.load, args=(ended.is_set,), daemon=True)
+            loading.start()
+            try:
+                viewer.run_until(lambda: False)
+            finally:
+                ended.set()
+                loading.join(_LOADING_ENDS_S)
 
 
 def report(
@@ -54,14 +65,37 @@ def report(
         refuse_split(run)
     for folder in finished_shots(run) if is_split(run) else [run]:
         path = out or RunFolder(folder).report
-        write_report(_open(folder), path)
+        write_report(open_run(folder), path)
         typer.echo(f"report: {path}")
 
 
-def _open(run: Path) -> Run:
+def share(
+    run: options.RunPath,
+    out: Annotated[Path | None, typer.Option(help="The page; RUN/share.html if not given.", show_default=False)] = None,
+    max_mb: Annotated[float, typer.Option(help="Most megabytes; points are left out to keep it.", min=0)] = 25.0,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames per second; those of the video if not given.", min=0.1, max=120)
+    ] = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Write one HTML page that plays the run in 3D in any browser, without a network."""
+    from uni4d_fg.results.view.share import write_page
+
+    with progress_reporter(quiet) as reporter:
+        page = write_page(
+            open_run(run), out or RunFolder(run).shared_page, max_mb, frames_per_second=fps, reporter=reporter
+        )
+    typer.echo(
+        f"page: {page.path}, {page.megabytes:.1f} MB, {page.frames} frames, "
+        f"{page.static_points} static and {page.moving_points} moving points"
+    )
+
+
+def open_run(run: Path, *, unfinished: bool = False) -> Run:
+    """Open a run with the sequence that it was made from; with ``unfinished`` one that is going on as well."""
     from uni4d_fg.cli.runs import stored_input
     from uni4d_fg.results.run import Run
     from uni4d_fg.results.shot_list import refuse_split
 
     refuse_split(run)
-    return Run(run, lambda: stored_input(run).read())
+    return Run(run, lambda: stored_input(run).read(), unfinished=unfinished)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-from pydantic import field_validator
+from pydantic import field_validator, model_validator
 
 from uni4d_fg.config.base import Section, setting
 
@@ -20,6 +20,18 @@ class CameraConfig(Section):
         "ask for it.",
         basic=True,
     )
+    zoom: Literal["auto", "on", "off"] = setting(
+        "auto",
+        "'auto' gives each frame a focal length of its own where the images ask for it; 'on' always does; 'off' is for "
+        "a lens that cannot zoom.",
+    )
+    zoom_per_frame: float = setting(
+        0.03, "Standard deviation of the change of the log focal length from frame to frame.", gt=0, le=1
+    )
+    min_zoom_evidence: float = setting(
+        0.003, "Part of the reprojection energy that a focal length per frame must take away to be taken.", ge=0, lt=1
+    )
+    min_zoom: float = setting(0.05, "Part by which the focal length must vary to be taken for a zoom.", gt=0, lt=1)
     observations: int = setting(20000, "Observations that the lens is found from, at most.", ge=1000)
     frames: int = setting(60, "Frames that the lens is found from, at most.", ge=3)
     hold_out_every: int = setting(5, "Every so many tracks, one is held out to judge the models.", ge=2)
@@ -42,3 +54,9 @@ class CameraConfig(Section):
         if not starts or any(not -1.0 < k1 < 1.0 for k1 in starts):
             raise ValueError("needs at least one distortion, each between -1 and 1")
         return starts
+
+    @model_validator(mode="after")
+    def _zoom_has_no_lens(self) -> CameraConfig:
+        if self.zoom == "on" and self.model not in ("auto", "pinhole"):
+            raise ValueError(f"zoom 'on' goes with model 'auto' or 'pinhole', not with '{self.model}'")
+        return self

@@ -29,6 +29,19 @@ class TrackingConfig(Section):
     max_iterations: int = setting(30, "Lucas-Kanade iterations per level.", ge=1)
     convergence_px: float = setting(0.01, "Lucas-Kanade stops when a point moves less than this, px.", gt=0)
     forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0, basic=True)
+    refine: Literal["auto", "on", "off"] = setting(
+        "off",
+        "Find each point's first view, affinely warped, in every image, so that errors of the steps do not add up. "
+        "'auto': with the C++ extension, as NumPy takes ten times as long; 'off': steps alone, each checked forwards "
+        "and backwards.",
+    )
+    patch_px: int = setting(15, "Side of the first view that is found again, px; made odd.", ge=5, le=61)
+    min_patch_correlation: float = setting(
+        0.8, "Correlation with its first view below which a point takes a new one where it is.", gt=0, lt=1
+    )
+    max_refinement_px: float = setting(
+        0.5, "The same if the first view is found farther than this from where the step leads, px.", gt=0
+    )
     max_drift_px: float | None = setting(
         None,
         "Largest distance between a point and where its first appearance is found, px; null: not checked. The check "
@@ -66,6 +79,15 @@ class LabelConfig(Section):
     max_depth_spread: float = setting(
         0.05, "Depth is interpolated only between pixels that differ by less than this fraction.", ge=0
     )
+    depth_edge_px: int = setting(
+        0,
+        "A static track has no depth this near (in x or y) to a surface in front of it, px: its window sees both, and "
+        "moves with the front one. 0: it has; 7 is half a patch.",
+        ge=0, le=100,
+    )  # fmt: skip
+    depth_edge_step: float = setting(
+        0.07, "What is nearer to the camera by more than this fraction is in front.", gt=0, lt=1
+    )
 
 
 class InputConfig(Section):
@@ -78,6 +100,14 @@ class InputConfig(Section):
         "estimate",
         "'estimate': ignore given poses; 'initial': start stage 2 from them; 'fixed': keep them.",
         basic=True,
+    )
+    black_bars: Literal["auto", "keep"] = setting(
+        "auto", "'auto' finds black bars beside the pictures and leaves them out; 'keep' takes them for content."
+    )
+    repeated_frames: Literal["auto", "keep"] = setting(
+        "auto",
+        "'auto' finds frames that repeat the one before, which a change of frame rate leaves, and gives them its pose; "
+        "'keep' solves them as frames of their own.",
     )
     min_depth_m: float = setting(0.05, "Depth below this is treated as missing, m.", ge=0, basic=True)
     max_depth_m: float = setting(80.0, "Depth above this is treated as missing, m.", gt=0, basic=True)

@@ -65,8 +65,25 @@ class GeometricDepthConfig(Section):
     sampled_frames: int = setting(20, "The two frames to start from are among this many, evenly spaced.", ge=2)
     fitted_tracks: int = setting(250, "Tracks of a pair of frames on which its parallax is measured, at most.", ge=8)
     enough_tracks: int = setting(300, "More common tracks than this make a pair of frames no better.", ge=8)
-    tried_pairs: int = setting(4, "Pairs of frames to start from that are tried, the best first.", ge=1)
-    trial_frames: int = setting(8, "Frames from one of the pair to the other that such a trial poses.", ge=2)
+    tried_pairs: int = setting(4, "Pairs of frames to start from that compete, the best first.", ge=1)
+    trial_frames: int = setting(24, "Frames around such a pair that a trial poses, at most.", ge=2)
+    trial_step: int = setting(8, "Frames of a trial from one of the pair to the other.", ge=1)
+    trial_tracks: int = setting(800, "Tracks of a trial, spread over its frames and the image.", ge=50)
+    held_out_every: int = setting(
+        4, "Every so many observations of a track, one is kept from a trial, which is judged by those.", ge=2
+    )
+    usual_focal: tuple[float, float] = setting(
+        (0.4, 3.0), "Starts that end with a focal length outside this range, as parts of the longer image side, are "
+        "taken only where no other explains the tracks.",
+    )  # fmt: skip
+    retries: int = setting(1, "How often frames that fit badly are taken out and posed again.", ge=0)
+    epipolar_px: float = setting(
+        1.0, "A track agrees with the epipolar geometry of most of the picture up to this distance, px.", gt=0
+    )
+    epipolar_steps: tuple[int, ...] = setting(
+        (3, 6), "That geometry is found between frames this far apart.", min_length=1
+    )
+    epipolar_per_cell: int = setting(6, "Tracks from each of 108 parts of the picture that it is found from.", ge=1)
     two_view_trials: int = setting(5000, "Trials of the robust essential matrix of two frames, at most.", ge=1)
     resection_trials: int = setting(500, "RANSAC trials of a frame's pose from the points it sees.", ge=1)
     focal_min_frames: int = setting(

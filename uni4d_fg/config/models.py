@@ -113,6 +113,8 @@ class Config(Section):
         for path, kernel in kernels.items():
             if (kernel.kind == "norm") != paper:
                 yield f"{path}.kind={kernel.kind}"
+        if not paper and moving.proximal_weight > 0:
+            yield "nonrigid.proximal_weight"
         switches = {
             "bundle_adjustment.measure_noise": adjustment.measure_noise,
             "bundle_adjustment.depth_prior": adjustment.depth_prior,

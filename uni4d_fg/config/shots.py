@@ -42,6 +42,12 @@ class ShotsConfig(Section):
         gt=0,
         le=1,
     )
+    min_blend_gain: float = setting(
+        0.14,
+        "Part of the variance of a frame of a dissolve that both shots explain beyond what one does, at least.",
+        ge=0,
+        lt=1,
+    )
     max_motion: float = setting(
         0.1, "Motion from frame to frame, part of the image, within which dissolves are looked for.", gt=0, lt=1
     )

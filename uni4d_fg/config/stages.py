@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import PositiveFloat
 
 from uni4d_fg.config.base import Section, setting
+from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.config.rejoin import RejoinConfig
 from uni4d_fg.config.solver import KernelConfig, SolverConfig
 
@@ -99,6 +100,12 @@ class BundleAdjustmentConfig(Section):
         gt=0,
         basic=True,
     )
+    blurred_frames: float | None = setting(
+        2.0,
+        "Frames whose reprojection residuals are this many times those of the frames around them after the first solve "
+        "weigh by what they say; null: all frames weigh alike.",
+        gt=1,
+    )
     min_reprojection_sigma_px: float = setting(0.1, "Floor of the measured reprojection sigma, px.", gt=0)
     min_depth_sigma: float = setting(0.002, "Floor of the measured depth sigma.", gt=0)
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=0.7), "Kernel of E_BA.")
@@ -185,6 +192,12 @@ class NonRigidConfig(Section):
     )
     reprojection: bool = setting(True, "Use E_NR.")
     depth_prior: bool = setting(True, "Use the depth prior.", basic=True)
+    proximal_weight: float = setting(
+        0.0,
+        "Energy 'paper': weight of the distance to the lifted points along their rays, in units of the lift's noise "
+        "and with depth_kernel. Keeps a solver that goes to the minimum from shrinking the scene; Adam goes without.",
+        ge=0,
+    )
     reprojection_sigma_px: float | None = setting(
         None, "Sigma of E_NR, px; null takes the one measured on the static scene.", gt=0, basic=True
     )
@@ -251,6 +264,11 @@ class JointConfig(Section):
 class FusionConfig(Section):
     """Dense depth that agrees with the sparse points, and the 4D cloud."""
 
+    static: Literal["field", "nearest_points"] = setting(
+        "field",
+        "How static depth is made: 'field' corrects the cue by a smooth field and weighs it with depth from several "
+        "views; 'nearest_points' corrects every pixel by its nearest control points alone, as what moves is.",
+    )
     neighbors: int = setting(3, "Control points per pixel (nearest in 3D, of the pixel's own instance).", ge=1)
     smoothing: int = setting(
         16,
@@ -276,6 +294,19 @@ class FusionConfig(Section):
         "Static depth of two frames is averaged where its logarithms differ by less than this many measured sigmas.",
         gt=0,
     )
+    multiview: MultiviewConfig = setting(MultiviewConfig(), "Depth of the static scene from several views.")
+    field_windows: tuple[float, ...] = setting(
+        (0.15, 0.05, 0.016),
+        "The smooth error of a cue is measured over Gaussian windows of these standard deviations, parts of the width.",
+    )
+    field_prior: float = setting(
+        0.005, "It is drawn to that of the wider window as if this part of a window agreed with it.", gt=0
+    )
+    broken_ratio: float = setting(
+        1.8, "A frame's cue is not used if it errs this many times as much as that of the median frame ...", gt=1
+    )
+    broken_share: float = setting(0.6, "... and this part of what a constant depth would err by.", gt=0)
+    min_broken_frames: int = setting(5, "Frames with landmarks that such a judgment takes.", ge=3)
     edge_relative_gradient: float = setting(
         0.05, "Pixels whose depth changes by more than this part per pixel are left out of the clouds.", gt=0
     )

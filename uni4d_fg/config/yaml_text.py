@@ -69,6 +69,9 @@ for _tag in (_INT_TAG, _FLOAT_TAG):
 _PlainLoader.add_implicit_resolver(
     _FLOAT_TAG, re.compile(r"^[-+]?[0-9]+(?:\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
 )
+# "on" and "off" are values of fields; as booleans there are true, false, yes and no.
+for _letter in "oO":
+    _PlainLoader.yaml_implicit_resolvers[_letter] = []
 
 
 def parse_yaml(text: str) -> Any:

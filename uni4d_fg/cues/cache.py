@@ -19,11 +19,12 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.cues.detections import FrameDetections
+from uni4d_fg.cues.packed_maps import load_map, save_map
 from uni4d_fg.errors import InputError, OutputError
-from uni4d_fg.files import atomic_path, atomic_write_text, load_checksums, load_npy, load_npz, save_npy, save_npz
+from uni4d_fg.files import atomic_path, atomic_write_text, load_npy, load_npz, save_npy, save_npz
 from uni4d_fg.frontend.sequence.frames import FileFrames
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Part of every key; raised whenever a maker gives other cues for the same image, card and configuration."""
 
 
@@ -41,10 +42,11 @@ def maker_key(*parts: Any) -> str:
 
 
 class FloatMaps(FileFrames[Float32Array]):
-    """T files of (H, W) float32 as they were written: disparity may be zero or negative, unlike depth."""
+    """T files of (H, W) float32, rounded as in ``packed_maps``: disparity may be zero or negative, unlike depth."""
 
     def _decode(self, path: Path) -> Float32Array:
-        values = load_npy(path)
+        # Earlier versions wrote plain arrays.
+        values: Float32Array = load_npy(path) if path.suffix == ".npy" else load_map(path)
         if values.ndim != 2 or values.dtype != np.float32:
             raise InputError(f"{path}: is not a map of the cue cache; remove it and start again")
         return values
@@ -62,23 +64,22 @@ class FrameCache:
 
     def map_path(self, key: str) -> Path:
         """Return the file of a map."""
-        return self.folder / f"{key}.npy"
+        return self.folder / f"{key}.map.npz"
 
     def has_map(self, key: str, size: tuple[int, int]) -> bool:
-        """Tell whether an undamaged map of (height, width) is there: it is read, and its checksum compared."""
+        """Tell whether an undamaged map of (height, width) is there: it is read, which compares its checksum."""
         path = self.map_path(key)
         if not path.is_file():
             return False
         try:
-            values = load_npy(path)
-            return values.shape == size and values.dtype == np.float32 and load_checksums(path) is not None
+            return load_map(path).shape == size
         except InputError:
             return False
 
     def put_map(self, key: str, values: Float32Array) -> Path:
-        """Write a map. Raises OutputError."""
+        """Write a map, rounded as :func:`~uni4d_fg.cues.packed_maps.save_map` says. Raises OutputError."""
         path = self.map_path(key)
-        save_npy(path, values.astype(np.float32, copy=False), checksum=True)
+        save_map(path, values)
         return path
 
     def camera(self, key: str) -> FloatArray | None:

@@ -20,7 +20,7 @@ from uni4d_fg.errors import ConfigError
 from uni4d_fg.reading import check_regular, expanded, resolved
 
 MODELS_VARIABLE = "UNI4D_FG_MODELS"
-"""Environment variable that names a folder of ONNX files, which is looked into first."""
+"""Environment variable that names the folder of ONNX files."""
 
 CardKind = Literal["depth", "segmentation", "tracks"]
 
@@ -111,18 +111,35 @@ class IntrinsicsOutput(Section):
     )
 
 
+class DownloadSpec(Section):
+    """Where the ONNX file of a card is published; it is fetched only when the user asks for it by name."""
+
+    url: str = required("Address of the ONNX file.", pattern=r"^https?://")
+    pointer: str = setting(
+        "", "Address of its Git LFS pointer, the SHA-256 and size that its source publishes; empty: the card's sha256."
+    )
+    size_bytes: int | None = setting(None, "Size of the file, bytes; null: as the pointer says.", ge=1)
+
+
 class BaseCard(Section):
     """What every card has."""
 
     kind: CardKind = required("What the network makes.")
     title: str = required("Name of the network, for messages.")
-    file: str = required("ONNX file, relative to the folder of the card or to that of UNI4D_FG_MODELS.")
+    file: str = required("ONNX file, relative to the folder of models or to that of the card.")
     sha256: str | None = setting(None, "SHA-256 of the file, hexadecimal; null: not checked.")
     license: str = required("License of the weights.")
     source: str = setting("", "Where the network is published.")
     export: str = required("How to make the ONNX file.")
+    download: DownloadSpec | None = setting(None, "Where the ONNX file is published; null: it has to be made.")
     input: InputSpec = required("The image that goes in.")
     size: SizeSpec = setting(SizeSpec(), "The size at which it goes in.")
+
+    @model_validator(mode="after")
+    def _can_be_checked(self) -> BaseCard:
+        if self.download is not None and not self.download.pointer and self.sha256 is None:
+            raise ValueError("a file that is downloaded needs a checksum: sha256, or download.pointer")
+        return self
 
 
 class DepthCard(BaseCard):
@@ -233,6 +250,15 @@ class ModelFile:
         return _places(self.card, self.path)
 
 
+def models_folder() -> Path:
+    """Return the user's folder of ONNX files: that of ``UNI4D_FG_MODELS``, or one in the user's data folder."""
+    named = os.environ.get(MODELS_VARIABLE)
+    if named:
+        return expanded(named)
+    data = os.environ.get("XDG_DATA_HOME")
+    return (expanded(data) if data else Path.home() / ".local" / "share") / "uni4d_fg" / "models"
+
+
 def cards_folder() -> Path:
     """Return the folder of the cards that come with the package."""
     return presets_folder() / "models"
@@ -301,8 +327,7 @@ def _places(card: Card, path: Path) -> tuple[Path, ...]:
     file = expanded(card.file)
     if file.is_absolute():
         return (file,)
-    folder = os.environ.get(MODELS_VARIABLE)
-    return (*((expanded(folder) / file,) if folder else ()), resolved(path.parent / file))
+    return (models_folder() / file, resolved(path.parent / file))
 
 
 def _names_of(kind: str) -> list[str]:

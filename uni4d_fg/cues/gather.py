@@ -10,6 +10,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.models import Config
+from uni4d_fg.counted import counted
 from uni4d_fg.cues.cache import FloatMaps
 from uni4d_fg.cues.geometric_depth import settings_for_geometry
 from uni4d_fg.cues.geometry_makers import aligned_depth, geometric_depth, moving_masks, video_key
@@ -17,8 +18,10 @@ from uni4d_fg.cues.intrinsics import shared_intrinsics
 from uni4d_fg.cues.manifest import save_manifest
 from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_masks, network_tracks
 from uni4d_fg.cues.plan import CuePlan, CueReport
+from uni4d_fg.cues.start_doubts import doubts_of_masks
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.bars import without_bars
 from uni4d_fg.frontend.sequence.calibration import guess_intrinsics
 from uni4d_fg.frontend.sequence.frames import no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
@@ -27,8 +30,8 @@ from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.progress import Reporter, SilentReporter
 
 NOT_METRIC = (
-    "depth is not metric: no depth was given, so it was found from the motion of the camera, which does not see scale; "
-    "all lengths are in a unit of its own"
+    "depth is not metric: no depth was given, so it was found from the motion of the camera, which leaves the scale "
+    "unknown; all lengths are in a unit of its own"
 )
 NOT_METRIC_RELATIVE = (
     "depth is not metric: the depth network gives relative depth, which was scaled to the motion of the camera; all "
@@ -69,6 +72,8 @@ def gather_cues(
         OutputError: If ``folder`` cannot be written.
         Cancelled: If ``should_stop`` turned true; frames that are done are kept.
     """
+    # For the tracker and the makers here; the stages look for themselves, as most cues are made of whole images.
+    video = without_bars(video, look=config.input.black_bars == "auto")
     work = _Gathering(
         video, plan, folder, config, reporter or SilentReporter(), should_stop or (lambda: False), track_cache or folder
     )
@@ -89,6 +94,7 @@ class _Gathering:
         self.track_file: Path | None = None
         self.intrinsics = video.intrinsics
         self.world_T_cam = video.initial_world_T_cam
+        self.cameras_of_motion: FloatArray | None = None
         self.motion_facts: list[str] = []
         self.motion_warnings: list[str] = []
         self._video_key: str | None = None
@@ -109,7 +115,10 @@ class _Gathering:
             masks = self._motion_masks(depths)
             if plan.depth == "geometry" or (network is not None and network.is_affine):
                 # What moves is known now, and was in the way of the cameras before.
+                before = self.cameras_of_motion
                 depths = self._scaled_by_motion(network, masks)
+                if before is not None and self.cameras_of_motion is not None:
+                    self.motion_warnings += doubts_of_masks(before, self.cameras_of_motion)
         if plan.keep_built_in_tracks:
             self._any_tracks()
         if self.intrinsics is None:
@@ -119,7 +128,7 @@ class _Gathering:
         sequence = as_sequence(
             replace(
                 self.video, depths=depths, masks=masks, intrinsics=self._start_intrinsics(), tracks=self.tracks,
-                initial_world_T_cam=self.world_T_cam,
+                initial_world_T_cam=self.world_T_cam, content=None,
             )
         )  # fmt: skip
         if not plan.is_given:
@@ -164,7 +173,7 @@ class _Gathering:
             self.config.motion_masks.instances, self.reporter, self.should_stop,
         )  # fmt: skip
         self.report.sources["masks"] = title
-        self.report.facts.append(f"masks: {count} instances by {title}")
+        self.report.facts.append(f"masks: {counted(count, 'instance')} by {title}")
         if count == 0:
             self.report.warnings.append(f"{title} finds nothing that may move: everything is taken for static")
         return masks
@@ -205,6 +214,8 @@ class _Gathering:
             self.config, self.reporter, self.should_stop,
         )  # fmt: skip
         report.metric = False
+        report.start = found.start
+        self.cameras_of_motion = found.world_T_cam
         self.intrinsics = found.intrinsics
         if video.intrinsics is None:
             report.sources["intrinsics"] = "from camera motion"

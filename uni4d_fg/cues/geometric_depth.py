@@ -8,7 +8,8 @@ place shows no depth at all: it is given a sphere of that radius, with a warning
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,24 +23,18 @@ from uni4d_fg.cues.interpolated_depth import (
     smooth_over_time,
     supported,
 )
+from uni4d_fg.cues.start_doubts import start_doubts, start_summary
 from uni4d_fg.cues.structure.motion import Structure, rotations_only, structure_from_motion
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
-from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.stages.observations import Observations
 
-_UNSURE_FOCAL = 0.03
-"""A relative standard deviation of the focal length above this is warned of."""
-_FEW_FRAMES = 0.5
-"""Fewer frames with a pose than this part of the video are warned of."""
 _SPHERE_STEP = 16
 """Spacing of the nodes between which a sphere is interpolated, px."""
-_PLAUSIBLE_FOCAL = (0.4, 3.0)
-"""Focal lengths, as parts of the longer image side, that cameras have: 103 to 19 degrees."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +55,10 @@ class GeometricDepth:
     """What was found, one line each."""
     warnings: tuple[str, ...]
     """What to distrust besides the scale, which is never metric; one line each."""
+    start: dict[str, Any] = field(default_factory=dict)
+    """What the motion leaves open, for the summary of a run: ``focal_interval_px`` (95 %), ``stretch_along_view`` (by
+    which factors depth and motion along the viewing direction may be wrong), ``unexplained`` (part of the held-out
+    tracks), ``registered`` (part of the frames), ``starts`` (those that explain the tracks nearly as well)."""
 
 
 def depth_from_motion(
@@ -165,33 +164,12 @@ def _with_maps(
         f"frames posed, {triangulated} of {len(structure.track)} static tracks triangulated, "
         f"noise {structure.sigma_px:.2f} px, fx {fx:.1f} fy {fy:.1f} px",
         f"scale by convention: median depth of the first frame is {settings.median_depth:g}",
+        f"focal length between {structure.focal.low:.0f} and {structure.focal.high:.0f} px (95 %); the cameras explain "
+        f"{100 * (1.0 - structure.unexplained):.0f} % of what was held out",
     )
-    warnings = tuple(_doubts(video, structure))
-    return GeometricDepth(depths, structure.world_T_cam, structure.intrinsics, sparse, True, facts, warnings)
-
-
-def _doubts(video: Video, structure: Structure) -> list[str]:
-    warnings = []
-    bridged = np.flatnonzero(~structure.registered).tolist()
-    if bridged:
-        severe = len(bridged) > (1.0 - _FEW_FRAMES) * video.num_frames
-        warnings.append(
-            f"{len(bridged)} frame(s) see too few points of the static scene, and their cameras are only interpolated"
-            f"{' (most of the video: do not trust this result)' if severe else ''}: {some_of(bridged)}"
-        )
-    if not structure.focal_deviation <= _UNSURE_FOCAL:
-        warnings.append(
-            f"this motion hardly tells the focal length (standard deviation {100 * structure.focal_deviation:.0f} %): "
-            "depth is stretched by as much as it is wrong; give K.npy if it is known"
-        )
-    focal = float(np.mean(structure.intrinsics[:2]))
-    side = float(max(video.image_size))
-    if not _PLAUSIBLE_FOCAL[0] * side <= focal <= _PLAUSIBLE_FOCAL[1] * side:
-        warnings.append(
-            f"the focal length found ({focal:.0f} px, {focal / side:.2f} of the longer image side) is unusual: moving "
-            "things without a mask, or motion from which it cannot be told; give K.npy if it is known"
-        )
-    return warnings
+    warnings = tuple(start_doubts(structure, video.image_size, settings))
+    start = start_summary(structure)
+    return GeometricDepth(depths, structure.world_T_cam, structure.intrinsics, sparse, True, facts, warnings, start)
 
 
 def _normalize(structure: Structure, observations: Observations, median_depth: float) -> Structure:
@@ -299,7 +277,7 @@ def _without_parallax(
     sparse[seen] = _on_sphere(tracks.uv[seen].astype(np.float64), intrinsics, config.median_depth)
     poses = rotations_only(observations, video.num_frames, intrinsics)
     warnings = (
-        "the camera does not move from its place (a turning camera explains the tracks to within "
+        "the camera only rotates (a pure rotation explains the tracks to within "
         f"{config.min_parallax_px:g} px), so depth cannot be seen: everything was put at distance "
         f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
     )

@@ -26,7 +26,7 @@ from uni4d_fg.progress import Reporter
 
 ShouldStop = Callable[[], bool]
 
-_RECORD = "structure"
+_RECORD = "start"
 
 
 def geometric_depth(
@@ -62,7 +62,7 @@ def geometric_depth(
     if stored is None or not all(cache.has_map(name, video.image_size) for name in names):
         result = depth_from_motion(video, tracks, is_static, intrinsics, config, reporter, should_stop)
         store_maps(iter(result.depths), video.num_frames, video.image_size, target, "depth maps", reporter, should_stop)
-        said = json.dumps([list(result.facts), list(result.warnings)])
+        said = json.dumps([list(result.facts), list(result.warnings), result.start])
         # Written last: with it, the maps are complete.
         cache.put_arrays(
             _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
@@ -71,10 +71,11 @@ def geometric_depth(
         stored = _stored_structure(cache, tracks)
         assert stored is not None
     paths = tuple(cache.map_path(f"{frame:06d}") for frame in range(video.num_frames))
-    facts, warnings = json.loads(str(stored["said"]))
+    facts, warnings, start = json.loads(str(stored["said"]))
     return GeometricDepth(
         FloatMaps(paths, video.image_size), stored["world_T_cam"], stored["intrinsics"],
         stored["sparse"].astype(np.float32), bool(stored["has_parallax"][0]), tuple(facts), tuple(warnings),
+        start,
     )  # fmt: skip
 
 

@@ -72,7 +72,9 @@ def open_mask_files(
     if not path.is_dir():
         check_regular(path, "a folder of masks or a COCO .json file")
         if path.suffix.lower() != ".json":
-            raise SequenceProblem(path, "is not a known form of masks", "give a folder of masks or a COCO .json file")
+            raise SequenceProblem(
+                path, "holds no masks that can be read", "give a folder of masks or a COCO .json file"
+            )
         content = read_json(path)
         if _is_class_list(content):
             return open_mask_files(
@@ -110,7 +112,7 @@ def _open_folder(
             found = some_of([f.name + "/" for f in below], 3) if below else "no masks"
             raise SequenceProblem(
                 root,
-                f"is not a known form of masks: {folder.name}/ holds {found}",
+                f"holds no masks that can be read: {folder.name}/ holds {found}",
                 "give the folder of one video, with one PNG or .npy per frame or one numbered folder per object",
             )
         folder = (known or below)[0]

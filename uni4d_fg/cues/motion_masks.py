@@ -24,6 +24,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.counted import counted
 from uni4d_fg.cues.appearance import FrameAppearance, frame_appearance, moved_evidence
 from uni4d_fg.cues.dense_flow import DenseFlow, shrink, shrunk_size, warp_back, working_scale
 from uni4d_fg.cues.depth_range import spread_at_tracks
@@ -112,8 +113,9 @@ def motion_masks(
     area = float(np.mean([np.count_nonzero(numbers) / numbers.size for numbers in labels]))
     report.end()
     facts = [
-        f"{len(kept)} instances move, {100 * area:.1f} % of the image; {int(motion.moving.sum())} tracks move, "
-        f"{int(motion.static.sum())} are static, {int((~motion.moving & ~motion.static).sum())} undecided"
+        f"{counted(len(kept), 'instance')} moving, {100 * area:.1f} % of the image; "
+        f"{int(motion.moving.sum())} tracks move, {int(motion.static.sum())} are static, "
+        f"{int((~motion.moving & ~motion.static).sum())} undecided"
     ]
     return MotionMasks(labels, cameras, motion, facts, _warnings(motion, area))
 

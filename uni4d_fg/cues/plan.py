@@ -164,8 +164,13 @@ class CueReport:
     warnings: list[str] = field(default_factory=list)
     metric: bool = True
     """Whether depth is in meters."""
+    start: dict[str, Any] = field(default_factory=dict)
+    """What camera motion leaves open, see :class:`~uni4d_fg.cues.geometric_depth.GeometricDepth`; empty where depth was
+    given."""
     settings: Config | None = None
     """The configuration to reconstruct with, where these cues ask for another one."""
+    seconds: float = 0.0
+    """Time that this call took to make or to find them."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -174,6 +179,8 @@ class CueReport:
             "facts": list(self.facts),
             "warnings": list(self.warnings),
             "metric": self.metric,
+            "seconds": self.seconds,
+            "start": dict(self.start),
         }
 
     @classmethod
@@ -184,6 +191,7 @@ class CueReport:
             list(data.get("facts", [])),
             list(data.get("warnings", [])),
             bool(data.get("metric", True)),
+            dict(data.get("start", {})),
         )
 
 

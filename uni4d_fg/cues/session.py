@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from uni4d_fg.config.networks import NetworkConfig
-from uni4d_fg.cues.card import MODELS_VARIABLE, ModelFile
+from uni4d_fg.cues.card import ModelFile
 from uni4d_fg.errors import InputError, MissingDependencyError
 from uni4d_fg.optim.threads import thread_count
 from uni4d_fg.optional import import_onnxruntime
@@ -25,6 +25,11 @@ _CHUNK = 1 << 22
 
 @lru_cache(maxsize=8)
 def _sha256(path: Path, size: int, modified: int) -> str:
+    return file_sha256(path)
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal."""
     digest = hashlib.sha256()
     with open(path, "rb") as stream:
         while chunk := stream.read(_CHUNK):
@@ -46,8 +51,8 @@ def weights_hash(model: ModelFile) -> str:
         looked = " and ".join(str(place) for place in model.searched())
         raise InputError(
             f"card {model.name}: there is no ONNX file of {model.card.title} (looked at {looked}); make it as the card "
-            f"says (uni4d-fg doctor --cards), then put it there, into the folder named by {MODELS_VARIABLE}, or "
-            f"give {model.name}=FILE"
+            f"says (uni4d-fg doctor --cards), or fetch it if it is published (uni4d-fg models fetch {model.name}); then"
+            f" put it there (uni4d-fg models add FILE) or give {model.name}=FILE"
         ) from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error

@@ -13,6 +13,7 @@ from uni4d_fg.factors.priors import aspect_prior, intrinsics_prior, log_scale_pr
 from uni4d_fg.factors.rigid_object import rigid_depth_prior, rigid_reprojection, rigid_smoothness
 from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness, velocity_smoothness
+from uni4d_fg.factors.zoom import zoom_smoothness, zoomed_reprojection
 
 __all__ = [
     "acceleration_smoothness",
@@ -41,4 +42,6 @@ __all__ = [
     "static_depth_prior",
     "static_reprojection",
     "velocity_smoothness",
+    "zoom_smoothness",
+    "zoomed_reprojection",
 ]

@@ -15,6 +15,7 @@
 | ``IMU_BIAS`` | b(frame) | (6,) accelerometer [m/s^2], gyroscope [rad/s], camera axes | 6 |
 | ``GRAVITY`` | g(0) | (3,) acceleration of gravity, world axes, m/s^2 | 3 |
 | ``GPS_MAP`` | e(map) | (4, 4) ``map_T_world`` | 6: body-frame (omega [rad], v [m]) |
+| ``ZOOM`` | z(frame) | (1,) logarithm of a frame's focal length over that of the intrinsics | 1 |
 | ``CUE_SCALE`` | c(cue) | (1,) log-scale that the depth cues of all frames share | 1 |
 """
 
@@ -111,3 +112,4 @@ IMU_BIAS = VariableType(
 GRAVITY = point_variable("gravity", "g", ("",))
 GPS_MAP = pose_variable("gps_map", "e", ("map",), label="pose of the world on the GPS map")
 CUE_SCALE = VariableType("cue_scale", "c", vector_space(1), ("cue",), label="log-scale of the depth cue")
+ZOOM = VariableType("zoom", "z", vector_space(1), label="log-focal length")

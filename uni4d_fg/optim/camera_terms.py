@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from uni4d_fg.optim.problem import Problem
 
 INTRINSICS_COLUMNS = 4
 """Border columns of the intrinsics, frozen ones included."""
+_GROUPED = 16
+"""Factors on the same variables from which on, at the mean, they are summed before they are added to the system."""
 _BAND_FRACTION = 0.4
 """A core is stored as a band if the band is narrower than this part of its size."""
 
@@ -179,20 +182,36 @@ class _Term:
 
     batch: FactorBatch
     slots: tuple[int, ...]
+    groups: tuple[IntArray, IntArray] | None
+    """Order of the factors in which those on the same G variables stand together, and where each group begins (G + 1,);
+    None where nearly each has its own."""
     gradient: tuple[IntArray, IntArray]
-    """Entries of the flattened J^T r (N, D) with a column, and the column."""
+    """Entries of the flattened J^T r (G, D) with a column, and the column; G is N without groups."""
     blocks: dict[str, tuple[IntArray, IntArray]]
-    """Per array of the system: entries of the flattened J^T J (N, D, D), and their flat place there."""
+    """Per array of the system: entries of the flattened J^T J (G, D, D), and their flat place there."""
 
     def add_to(self, system: CameraSystem, r: FloatArray, jacobians: list[FloatArray]) -> None:
         """Add J^T J and J^T r of whitened residuals and Jacobians."""
         camera = np.concatenate([jacobians[i] for i in self.slots], axis=2)
-        transposed = np.swapaxes(camera, 1, 2)
+        slopes, products = self._products(camera, r)
         entries, places = self.gradient
-        np.add.at(system.gradient, places, (transposed @ r[:, :, None]).reshape(-1)[entries])
-        products = (transposed @ camera).reshape(-1)
+        np.add.at(system.gradient, places, slopes.reshape(-1)[entries])
+        products = products.reshape(-1)
         for name, (entries, places) in self.blocks.items():
             np.add.at(getattr(system, name).reshape(-1), places, products[entries])
+
+    def _products(self, camera: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return J^T r (G, D) and J^T J (G, D, D)."""
+        if self.groups is None:
+            transposed = np.swapaxes(camera, 1, 2)
+            return (transposed @ r[:, :, None])[:, :, 0], transposed @ camera
+        order, begin = self.groups
+        camera, r, width = camera[order], r[order], camera.shape[2]
+        slopes, products = np.empty((len(begin) - 1, width)), np.empty((len(begin) - 1, width, width))
+        for group, (first, last) in enumerate(pairwise(begin.tolist())):
+            jacobian = camera[first:last].reshape(-1, width)
+            slopes[group], products[group] = r[first:last].reshape(-1) @ jacobian, jacobian.T @ jacobian
+        return slopes, products
 
 
 class CameraTerms:
@@ -225,8 +244,15 @@ def _term(batch: FactorBatch, columns: CameraColumns) -> _Term:
     slots = tuple(i for i, at in of_slot.items() if (at >= 0).any())
     width = sum(batch.slots[i].variable.dim for i in slots)
     at = np.concatenate([np.zeros((len(batch), 0), dtype=np.int64), *(of_slot[i] for i in slots)], axis=1)
-    row = np.broadcast_to(at[:, :, None], (len(batch), width, width)).reshape(-1)
-    column = np.broadcast_to(at[:, None, :], (len(batch), width, width)).reshape(-1)
+    groups = None
+    if slots:
+        rows = np.stack([batch.slots[i].rows for i in slots])
+        order = np.lexsort(rows)
+        starts = np.flatnonzero(np.diff(rows[:, order], axis=1, prepend=-1).any(axis=0))
+        if _GROUPED * len(starts) <= len(batch):
+            groups, at = (order, np.append(starts, len(batch))), at[order[starts]]
+    row = np.broadcast_to(at[:, :, None], (len(at), width, width)).reshape(-1)
+    column = np.broadcast_to(at[:, None, :], (len(at), width, width)).reshape(-1)
     size, stored = columns.size, columns.stored_rows
     known = (row >= 0) & (column >= 0)
     core = np.flatnonzero(known & (row < size) & (column <= row))
@@ -238,4 +264,4 @@ def _term(batch: FactorBatch, columns: CameraColumns) -> _Term:
         "corner": (corner, (row[corner] - size) * columns.border + column[corner] - size),
     }
     used = np.flatnonzero(at.reshape(-1) >= 0)
-    return _Term(batch, slots, (used, at.reshape(-1)[used]), {k: v for k, v in blocks.items() if len(v[0])})
+    return _Term(batch, slots, groups, (used, at.reshape(-1)[used]), {k: v for k, v in blocks.items() if len(v[0])})

@@ -10,7 +10,9 @@ clusters, errors may be anything within a cluster and are independent between cl
 where A is the reduced Hessian with the mean slope of each kernel (not the weight of reweighted least squares, which is
 larger), and B_0 the information of factors without landmarks. No correlation has to be modeled: it is in the sums.
 With independent errors of the factors' sigmas this is A^{-1} again, known from about as many samples as there are
-clusters. Errors that all clusters share (lens distortion that is alike everywhere) are not seen.
+clusters; because these are few, the sum over clusters is steadied by what independent errors would give
+(:mod:`uni4d_fg.optim.few_clusters`). Errors that all clusters share (lens distortion that is alike everywhere) are not
+seen.
 Source: Huber 1967, "The behavior of maximum likelihood estimates under nonstandard conditions"; Liang and Zeger 1986,
 "Longitudinal data analysis using generalized linear models".
 """
@@ -28,7 +30,8 @@ from uni4d_fg.factors.kernels import Kernel
 from uni4d_fg.factors.marginalization_prior import MARGINALIZATION_PRIOR
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
-from uni4d_fg.factors.variable_types import LANDMARK
+from uni4d_fg.factors.variable_types import LANDMARK, POSE
+from uni4d_fg.optim.few_clusters import blend
 from uni4d_fg.optim.layout import DenseLayout
 from uni4d_fg.optim.marginals import CameraMarginals, camera_marginals
 from uni4d_fg.optim.problem import Problem
@@ -62,10 +65,17 @@ class Spread:
         """Clusters that have any observation."""
         return int(np.any(self.scores != 0.0, axis=1).sum())
 
-    def covariance(self) -> FloatArray:
-        """Return the covariance (n, n), with the factor G / (G - 1) of a sample covariance."""
+    @property
+    def unbiased_scores(self) -> FloatArray:
+        """The scores with the factor G / (G - 1) of a sample covariance on their squares."""
         used = max(self.num_used, 2)
-        result: FloatArray = used / (used - 1.0) * self.scores.T @ self.scores + self.rest
+        result: FloatArray = np.sqrt(used / (used - 1.0)) * self.scores
+        return result
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance (n, n) of the gradient."""
+        scores = self.unbiased_scores
+        result: FloatArray = scores.T @ scores + self.rest
         return result
 
     def project(self, matrix: FloatArray) -> Spread:
@@ -181,8 +191,22 @@ def clustered_marginals(
     spread = gradient_spread(problem.batches, state, marginals.layout, clusters, eliminate, carried, held=held)
     if spread.num_used < MIN_CLUSTERS:
         return marginals
+    return steadied(marginals, spread)
+
+
+def steadied(marginals: CameraMarginals, spread: Spread) -> CameraMarginals:
+    """Return the covariance that a spread of the gradient gives, see :mod:`uni4d_fg.optim.few_clusters`."""
     inverse = marginals.covariance
-    return replace(marginals, covariance=inverse @ spread.covariance() @ inverse)
+    if POSE not in marginals.layout.offset:
+        return replace(marginals, covariance=inverse @ spread.covariance() @ inverse)
+    influence = spread.unbiased_scores @ inverse
+    rest = replace(marginals, covariance=inverse @ spread.rest @ inverse)
+    num_poses = marginals.layout.count[POSE]
+    columns = marginals.layout.columns(POSE, np.arange(num_poses))
+    weights = blend(influence[:, columns], marginals.blocks(POSE, num_poses), rest.blocks(POSE, num_poses))
+    covariance = weights.clusters * influence.T @ influence + rest.covariance
+    covariance += weights.model * (inverse - rest.covariance)
+    return replace(marginals, covariance=covariance)
 
 
 def _own_columns(batch: FactorBatch, layout: DenseLayout) -> list[IntArray]:

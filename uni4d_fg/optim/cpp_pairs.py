@@ -25,6 +25,7 @@ from uni4d_fg.optim.extension import KERNEL_CODES, batch_energy, has_kernel, imp
 from uni4d_fg.optim.objective import SolvedPart, Step
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.schur import SchurObjective
+from uni4d_fg.optim.threads import thread_count
 
 _MOST_COLUMNS = 2000
 """Free entries above which a dense system is no longer the better choice."""
@@ -107,7 +108,7 @@ class CppPairObjective:
                     pose_columns=poses,
                     intrinsics_columns=np.ascontiguousarray(intrinsics),
                     size=self.size,
-                    threads=threads or 0,
+                    threads=thread_count(threads),
                 )
             except ValueError as error:
                 batch.linearize(state)  # names the offending factor

@@ -2,7 +2,8 @@
 
 The same linear algebra as :mod:`uni4d_fg.optim.schur` and the same results up to rounding. Static reprojection and the
 static depth prior are linearized and eliminated in C++. Every other factor takes part as linearized blocks: on
-landmarks through :mod:`uni4d_fg.optim.linearized_landmarks`, on cameras and on variables of any other type through
+landmarks through :mod:`uni4d_fg.optim.linearized_landmarks` (C++ computes the blocks that it has a kernel for,
+reprojection through a lens among them), on cameras and on variables of any other type through
 :mod:`uni4d_fg.optim.camera_terms`. The reduced camera system goes to LAPACK, as a band where frames far apart share no
 landmark.
 """
@@ -111,10 +112,10 @@ class CppSchurObjective:
         self._foreign = LinearizedLandmarks(foreign, self.columns, self.landmark_free)
         reprojection = [b for b in own if b.factor_type is static_reprojection]
         depth = [b for b in own if b.factor_type is static_depth_prior]
-        self._batches = reprojection + depth
+        self._batches, self._num_reprojection = reprojection + depth, len(reprojection)
         try:
             self._system: Any = core.LandmarkSystem(
-                [_arrays(batch, "uv") for batch in reprojection],
+                [*(_arrays(batch, "uv") for batch in reprojection), *_storage(self._foreign)],
                 [_arrays(batch, "depth") for batch in depth],
                 self.num_frames,
                 self.landmark_free.astype(np.int64),
@@ -130,7 +131,10 @@ class CppSchurObjective:
     def energies(self, state: State) -> dict[str, float]:
         """Return the energy per term."""
         out = {batch.name: 0.0 for batch in self.problem.batches}
-        for batch, energy in zip(self._batches, self._system.energies(*self._arguments(state)).tolist(), strict=True):
+        energies = self._system.energies(*self._arguments(state)).tolist()
+        if len(energies) > len(self._batches):
+            del energies[self._num_reprojection]  # of the storage for foreign factors
+        for batch, energy in zip(self._batches, energies, strict=True):
             out[batch.name] += energy
         for batch in (*self._terms.batches, *self._foreign.batches):
             out[batch.name] += batch_energy(batch, state)
@@ -191,6 +195,18 @@ def _arrays(batch: FactorBatch, measured: str) -> tuple[Any, ...]:
         rows[POSE], rows[LANDMARK], _dense(batch.data[measured]), _dense(batch.sigma), _dense(batch.weight),
         KERNEL_CODES[kernel.kind], kernel.threshold,
     )  # fmt: skip
+
+
+def _storage(foreign: LinearizedLandmarks) -> list[tuple[Any, ...]]:
+    """Return a batch of weight 0 on every pair of frame and landmark that foreign factors couple; none where none do.
+
+    With it the system plans where their part of E stands.
+    """
+    frames, landmarks = foreign.pairs()
+    if not len(frames):
+        return []
+    one = np.ones(len(frames))
+    return [(frames, landmarks, np.zeros((len(frames), 2)), one, np.zeros(len(frames)), KERNEL_CODES["quadratic"], 1.0)]
 
 
 class CppSchurLinearization:

@@ -28,6 +28,7 @@ from uni4d_fg.optim.diagnosis import undetermined, undetermined_message
 from uni4d_fg.optim.extension import KERNEL_CODES, batch_energy, import_extension
 from uni4d_fg.optim.objective import SolvedPart, Step
 from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.threads import thread_count
 
 
 def _dense(array: Any) -> FloatArray:
@@ -94,7 +95,7 @@ class CppTrajectoryObjective:
         self.problem, self.config, self.variable = problem, config, variable
         self.num_points = len(state[variable])
         track = np.ascontiguousarray(state.numbers(variable)[:, 0])
-        self._system: Any = core.TrajectorySystem(track, threads or 0)
+        self._system: Any = core.TrajectorySystem(track, thread_count(threads))
         self._batches = [batch for batch in problem.batches if len(batch)]
         self._index: dict[int, int] = {}
         """Index in the system of every batch that is handed over linearized, by its place."""

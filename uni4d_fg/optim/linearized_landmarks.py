@@ -1,8 +1,8 @@
 r"""Factors of any type on landmarks, for the C++ landmark solver: handed over as linearized blocks.
 
-The C++ system keeps E (landmarks with cameras), V and g_l of its own two factor types. What other factors add to V
-and g_l goes into it. What they add to E, call it F, stays here, and the reduced system is corrected by the products
-that the C++ elimination does not know,
+The C++ system keeps E (landmarks with frames), V and g_l. What other factors add to these goes into it: storage for
+their pairs of frame and landmark is planned with a batch of weight 0. What couples landmarks with any other variable,
+call it F, stays here, and the reduced system is corrected by the products that the C++ elimination does not know,
 
     (E + F) V^{-1} (E + F)^T - E V^{-1} E^T = E V^{-1} F^T + F V^{-1} E^T + F V^{-1} F^T,
 
@@ -18,10 +18,12 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable_types import LANDMARK
+from uni4d_fg.factors.variable_types import LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.optim.camera_terms import CameraColumns, CameraSystem, CameraTerms
 from uni4d_fg.optim.extension import linearize_batch
 
+_OF_A_FRAME = {POSE: slice(0, 6), LOG_SCALE: slice(6, 7)}
+"""Variables that E has columns for, of the seven of a frame."""
 _CHUNK = 256
 """Landmarks corrected together: their rows of E^T fit the cache."""
 
@@ -34,12 +36,14 @@ class LinearizedLandmarks:
         self.batches, self.columns, self.free = batches, columns, landmark_free
         self._cameras = CameraTerms(batches, columns)
         self._slot = [next(i for i, s in enumerate(b.slots) if s.variable is LANDMARK) for b in batches]
-        touched = [np.unique(b.slots[i].rows) for b, i in zip(batches, self._slot, strict=True)]
-        landmarks = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *touched]))
+        places, touched = [], [np.zeros(0, dtype=np.int64)]
+        for batch, i in zip(batches, self._slot, strict=True):
+            others = [s for s in batch.slots if columns.has(s.variable) and s.variable not in _OF_A_FRAME]
+            places += [columns.of_slot(s.variable, s.rows).reshape(-1) for s in others]
+            touched += [np.unique(batch.slots[i].rows)] if others else []
+        landmarks = np.unique(np.concatenate(touched))
         self.landmarks: IntArray = landmarks[landmark_free[landmarks]]
-        places = [
-            columns.of_slot(s.variable, s.rows).reshape(-1) for b in batches for s in b.slots if columns.has(s.variable)
-        ]
+        """Those that are coupled with a variable that is not of a frame."""
         used = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *places]))
         self._columns: IntArray = used[used >= 0]
         self._coupling: FloatArray = np.zeros((0, 3, 0))
@@ -52,26 +56,42 @@ class LinearizedLandmarks:
         """
         linearized = [linearize_batch(batch, state) for batch in self.batches]
         self._cameras.add_linearized(system, linearized)
-        count = len(self.landmarks)
-        blocks, gradients = np.zeros((count, 3, 3)), np.zeros((count, 3))
         # One column more than the factors touch, for entries that are frozen.
-        coupling = np.zeros((count, 3, len(self._columns) + 1))
+        width = len(self._columns) + 1
+        coupling = np.zeros(len(self.landmarks) * 3 * width)
+        largest = 0.0
         for batch, slot, (r, jacobians) in zip(self.batches, self._slot, linearized, strict=True):
             moving = np.flatnonzero(self.free[batch.slots[slot].rows])
-            at = np.searchsorted(self.landmarks, batch.slots[slot].rows[moving])
-            point, r = jacobians[slot][moving], r[moving]
-            np.add.at(blocks, at, np.swapaxes(point, 1, 2) @ point)
-            np.add.at(gradients, at, np.einsum("nda,nd->na", point, r))
+            rows = np.ascontiguousarray(batch.slots[slot].rows[moving], dtype=np.int64)
+            point = np.swapaxes(jacobians[slot][moving], 1, 2)
+            largest = core.add_to_landmarks(
+                rows, np.ascontiguousarray(point @ jacobians[slot][moving]), (point @ r[moving][:, :, None])[:, :, 0]
+            )
             for i, s in enumerate(batch.slots):
                 if not self.columns.has(s.variable):
                     continue
+                product = point @ jacobians[i][moving]
+                if s.variable in _OF_A_FRAME:
+                    of_frame = np.zeros((len(rows), 3, 7))
+                    of_frame[:, :, _OF_A_FRAME[s.variable]] = product
+                    core.add_to_coupling(np.ascontiguousarray(s.rows[moving], dtype=np.int64), rows, of_frame)
+                    continue
                 column = self.columns.of_slot(s.variable, s.rows[moving])
-                place = np.where(column >= 0, np.searchsorted(self._columns, column), len(self._columns))
-                product = np.einsum("nda,ndc->nac", point, jacobians[i][moving])
-                np.add.at(coupling, (at[:, None, None], np.arange(3)[:, None], place[:, None, :]), product)
-        self._coupling = coupling[:, :, :-1]
-        largest: float = core.add_to_landmarks(self.landmarks, blocks, gradients)
+                place = np.where(column >= 0, np.searchsorted(self._columns, column), width - 1)
+                row = 3 * np.searchsorted(self.landmarks, rows)[:, None, None] + np.arange(3)[:, None]
+                entry = row * width + place[:, None, :]
+                coupling += np.bincount(entry.reshape(-1), product.reshape(-1), len(coupling))
+        self._coupling = coupling.reshape(-1, 3, width)[:, :, :-1]
         return largest
+
+    def pairs(self) -> tuple[IntArray, IntArray]:
+        """Return the frames (P,) and landmarks (P,) that the factors couple, each pair once."""
+        found = [np.zeros((0, 2), dtype=np.int64)]
+        for batch, slot in zip(self.batches, self._slot, strict=True):
+            landmark = batch.slots[slot].rows
+            found += [np.stack([s.rows, landmark], axis=1) for s in batch.slots if s.variable in _OF_A_FRAME]
+        both = np.unique(np.concatenate(found), axis=0)
+        return np.ascontiguousarray(both[:, 0]), np.ascontiguousarray(both[:, 1])
 
     def correct(self, core: Any, reduced: CameraSystem) -> None:
         """Correct a reduced system in place for the coupling that ``core`` does not know."""

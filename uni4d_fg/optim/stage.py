@@ -56,6 +56,15 @@ class Stage:
     """Ways to go: successive solves each, of which the last is exact. All start alike; the lowest end is kept."""
     own_world: bool = False
     """Its world begins at a camera of its own, not at the video's first, and meters there may be others."""
+    bounds: frozenset[str] = frozenset()
+    """Names of terms that keep a solver which goes to the minimum near the start, and are no part of the energy."""
+
+    def unbounded(self) -> Stage:
+        """Return the stage without its bounds: what a descent that stops early solves, and what is compared."""
+        if not self.bounds:
+            return self
+        kept = tuple(batch for batch in self.problem.batches if batch.name not in self.bounds)
+        return replace(self, problem=replace(self.problem, batches=kept), bounds=frozenset())
 
     @property
     def name(self) -> str:

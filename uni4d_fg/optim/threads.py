@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from typing import Any, TypeVar
 
@@ -31,10 +31,40 @@ def one_blas_thread() -> AbstractContextManager[Any]:
     return limit_blas_threads(1)
 
 
+_limits: list[int] = []
+"""Of the contexts of :func:`thread_limit` that are open; the last one counts."""
+
+
+@contextmanager
+def thread_limit(count: int) -> Iterator[None]:
+    """Give all array code of this process a number of threads: the solvers, BLAS, OpenMP and OpenCV.
+
+    Results of equal numbers are equal to the last bit, on as many cores as there may be.
+    """
+    import cv2
+
+    before = cv2.getNumThreads()
+    _limits.append(count)
+    cv2.setNumThreads(count)
+    try:
+        with ThreadpoolController().limit(limits=count):
+            yield
+    finally:
+        _limits.pop()
+        cv2.setNumThreads(before)
+
+
+def current_limit() -> int | None:
+    """Return the number of threads of the innermost :func:`thread_limit`; None outside of any."""
+    return _limits[-1] if _limits else None
+
+
 def thread_count(requested: int | None = None) -> int:
-    """Return the number of worker threads: as requested, or the cores this process may use."""
+    """Return the number of worker threads: as requested, else as limited, else the cores this process may use."""
     if requested is not None:
         return max(1, requested)
+    if _limits:
+        return _limits[-1]
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS and Windows

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from uni4d_fg.arrays import ImageArray, Int32Array
+from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import Sequence
@@ -23,18 +23,24 @@ from uni4d_fg.results.fusion.clouds import dynamic_cloud, dynamic_clouds, static
 from uni4d_fg.results.io import save_reconstruction
 from uni4d_fg.results.pictures import draw_depth_strip, draw_scene, draw_trajectory
 from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.results.track_colors import track_colors
 from uni4d_fg.slam.reconstruction import OBJECT_ARRAYS, Reconstruction
 
 ValueT = TypeVar("ValueT")
 
 
 def assemble(
-    sequence: Sequence, labelled: LabelledTracks, scene: Arrays, motion: Arrays, lens: Lens = PINHOLE
+    sequence: Sequence,
+    labelled: LabelledTracks,
+    scene: Arrays,
+    motion: Arrays,
+    lens: Lens = PINHOLE,
+    zoom: FloatArray | None = None,
 ) -> Reconstruction:
     """Bring the stages' results into one :class:`Reconstruction`, with colors from the images."""
     landmark_track = scene["landmark_track"].astype(np.int32)
     dynamic_track = motion["track"].astype(np.int32)
-    colors = _track_colors(sequence, labelled, np.concatenate([landmark_track, dynamic_track]))
+    colors = track_colors(sequence, labelled, np.concatenate([landmark_track, dynamic_track]))
     return Reconstruction(
         world_T_cam=scene["world_T_cam"],
         intrinsics=scene["intrinsics"],
@@ -53,23 +59,9 @@ def assemble(
         pose_covariance=scene.get("pose_covariance"),
         intrinsics_covariance=scene.get("intrinsics_covariance"),
         lens=lens,
+        zoom=zoom,
         **{name: motion[name] for name in OBJECT_ARRAYS if name in motion},
     )
-
-
-def _track_colors(sequence: Sequence, labelled: LabelledTracks, tracks: Int32Array) -> ImageArray:
-    """Return the image color of each track in the first frame that shows it, (N, 3) RGB."""
-    out = np.zeros((len(tracks), 3), dtype=np.uint8)
-    if len(tracks) == 0:
-        return out
-    first = np.argmax(labelled.weight[tracks] > 0, axis=1)
-    height, width = sequence.image_size
-    for frame in np.unique(first).tolist():
-        mine = np.flatnonzero(first == frame)
-        uv = np.rint(labelled.tracks.uv[tracks[mine], frame]).astype(np.int64)
-        image = sequence.images[frame]
-        out[mine] = image[np.clip(uv[:, 1], 0, height - 1), np.clip(uv[:, 0], 0, width - 1)]
-    return out
 
 
 def write_result(folder: RunFolder, reconstruction: Reconstruction) -> None:
@@ -102,7 +94,7 @@ def write_views(
     if not (config.output.clouds or config.output.pictures):
         return
     depth = read_depth(folder.depth)
-    intrinsics, poses, lens = reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.lens
+    intrinsics, poses, lens = reconstruction.frame_intrinsics, reconstruction.world_T_cam, reconstruction.lens
     static = static_cloud(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, lens=lens)
     if config.output.clouds:
         moving = dynamic_clouds(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, lens)
@@ -117,7 +109,7 @@ def write_views(
                 sequence.images[frame],
                 depth[frame],
                 sequence.masks[frame],
-                intrinsics,
+                intrinsics[frame],
                 poses[frame],
                 config.fusion,
                 lens,

@@ -31,7 +31,7 @@ def check_sequence(sequence: Sequence) -> None:
         if found != count:
             raise SequenceProblem(where, f"has {found} {name}, but there are {count} images", "give one per image")
     intrinsics = sequence.intrinsics
-    shown = intrinsics.tolist() if intrinsics.size <= 4 else intrinsics.shape
+    shown = intrinsics.tolist() if intrinsics.shape == (4,) else f"of shape {intrinsics.shape}"
     if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
         raise SequenceProblem(
             where,

@@ -16,7 +16,7 @@ from uni4d_fg.frontend.sequence.model import Sequence
 _Check = Callable[[Any, tuple[int, int], str], np.ndarray]
 _CHECKS: dict[str, _Check] = {"image": checked_image, "depth": floating_depth, "mask": checked_mask}
 
-ALGORITHM_VERSION = 2
+ALGORITHM_VERSION = 3
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""
 
 

@@ -5,20 +5,36 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
+from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.depth_store import write_depth
 from uni4d_fg.results.fusion.averaging import average_over_frames
+from uni4d_fg.results.fusion.broken_frames import contradicting_frames
+from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
+from uni4d_fg.results.fusion.multiview.measured import MultiviewDepth
+from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize, working_frame
+from uni4d_fg.results.fusion.static_depth import StaticDepth, fuse_static, known_depth, spread_at_landmarks
+from uni4d_fg.slam.reconstruction import zoomed
+
+_CARRIED_REACH, _CARRIED_FROM = 6, 2
+"""A frame without a cue takes the depth of this many frames at most this far away."""
+_EDGE = 0.04
+"""Change of log depth over a pixel of the working size, from which on there may be an edge."""
 
 
 def fuse_depth(
@@ -30,76 +46,217 @@ def fuse_depth(
     config: FusionConfig,
     reporter: Reporter,
     should_stop: Callable[[], bool],
-) -> None:
+    zoom: FloatArray | None = None,
+    lens: Lens = PINHOLE,
+) -> dict[str, Any]:
     """Write the fused depth of all frames.
 
     Args:
         path: The ``depth.npy`` of the run.
-        sequence: Depth cue and masks.
+        sequence: Images, depth cue and masks.
         labelled: Observations, with the cue at each.
         scene: Record of stage 2.
         motion: Record of stage 3.
         config: Fusion.
         reporter: Progress, in frames.
         should_stop: Polled before every frame.
+        zoom: (T,) focal length of each frame over that of the record's intrinsics; None without a zoom.
+        lens: Distortion of the images; distorted ones are not matched.
+
+    Returns:
+        What the summary says of it: ``facts``, ``warnings`` and ``broken_frames``.
 
     Raises:
         Cancelled: If ``should_stop`` said so; nothing is left behind.
         OutputError: If the file cannot be written.
     """
-    maps = _DenseMaps(sequence, labelled, scene, motion, config)
+    core, _ = find_extension()
+    unmatched = "" if config.multiview.enabled else "is switched off"
+    if config.multiview.enabled and not lens.is_pinhole:
+        unmatched = "is not made of distorted images"
+    elif config.multiview.enabled and zoom is not None:
+        unmatched = "is not made of frames that zoom"
+    elif config.multiview.enabled and not hasattr(core, "plane_sweep"):
+        unmatched = f"needs the C++ extension: {INSTALL_COMMAND}"
+    if unmatched:
+        off = config.multiview.model_copy(update={"enabled": False})
+        config = config.model_copy(update={"multiview": off})
+    control = [control_points(labelled, scene, motion, frame) for frame in range(sequence.num_frames)]
+    broken = contradicting_frames(control, config)
+    intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)
+    maps = DenseMaps(sequence, control, scene, config, intrinsics, frozenset(broken), unmatched)
+    if not unmatched and not maps.gains_by_matching():
+        off = config.multiview.model_copy(update={"enabled": False})
+        config = config.model_copy(update={"multiview": off})
+        unmatched = "adds nothing to this cue, as landmarks say"
+    maps = DenseMaps(sequence, control, scene, config, intrinsics, frozenset(broken), unmatched)
     with write_depth(path, sequence.num_frames, sequence.image_size) as writer:
         for frame in range(sequence.num_frames):
             if should_stop():
                 raise Cancelled("stopped during fusion; finished stages are kept, --resume continues from them")
-            writer.write(frame, maps.averaged(frame))
+            writer.write(frame, maps.final(frame))
             reporter.advance(frame + 1)
+    return maps.summary()
+
+
+_TRIED_FRAMES = 3
+"""Frames that are matched first: where landmarks prefer the cue in all of them, no others are matched."""
 
 
 @dataclass
-class _DenseMaps:
-    """Dense depth of single frames, kept as long as frames near them need it."""
+class DenseMaps:
+    """Dense depth of single frames, kept as long as frames near them need it; frames are asked for in order."""
 
     sequence: Sequence
-    labelled: LabelledTracks
+    control: list[ControlPoints]
     scene: Arrays
-    motion: Arrays
     config: FusionConfig
-    made: dict[int, tuple[Float32Array, BoolArray]] = field(default_factory=dict)
-    """Per frame: depth, and where it is static."""
+    intrinsics: FloatArray
+    """(T, 4) px."""
+    broken: frozenset[int]
+    """Frames whose cue is not used."""
+    unmatched: str = ""
+    """Why there is no depth from several views."""
+    size: WorkingSize = field(init=False)
+    multiview: MultiviewDepth = field(init=False)
+    matched: int = 0
+    """Frames with depth from several views."""
+    made: dict[int, tuple[StaticDepth, Float32Array]] = field(default_factory=dict)
+    """Per frame: static depth, and the raw cue, at working size."""
 
-    def averaged(self, frame: int) -> Float32Array:
-        """Return the final depth of a frame; frames are asked for in order."""
-        offsets = self.config.averaged_offsets
-        near = [frame + sign * offset for offset in offsets for sign in (-1, 1)]
-        near = [other for other in near if 0 <= other < self.sequence.num_frames]
-        for old in [other for other in self.made if other < frame - max(offsets, default=0)]:
-            del self.made[old]
-        depth, static = self._dense(frame)
-        if not near:
-            return depth
-        poses = self.scene["world_T_cam"]
-        result = average_over_frames(
-            self._static(frame),
-            poses[frame],
-            ((self._static(other), poses[other]) for other in near),
-            self.scene["intrinsics"],
-            self.config.averaged_sigmas * float(self.scene["noise"][1]),
+    def __post_init__(self) -> None:
+        multiview = self.config.multiview
+        self.size = WorkingSize.of(self.sequence.image_size, multiview.longer_side_px)
+        poses: FloatArray = self.scene["world_T_cam"]
+        self.multiview = MultiviewDepth(
+            self._working_frame, self.size, self.intrinsics[0], poses, self._landmarks, multiview
         )
-        return np.where(static, result, depth)
 
-    def _static(self, frame: int) -> Float32Array:
-        depth, static = self._dense(frame)
-        return np.where(static, depth, np.float32(np.nan))
+    def gains_by_matching(self) -> bool:
+        """Tell whether landmarks prefer matched depth to the corrected cue in any of a few frames; uses up the maps."""
+        sound = [frame for frame in range(self.sequence.num_frames) if frame not in self.broken]
+        for at in evenly_spread(len(sound), _TRIED_FRAMES).tolist():
+            self._static(sound[at])
+        return self.matched > 0 or bool(self.broken)
 
-    def _dense(self, frame: int) -> tuple[Float32Array, BoolArray]:
+    def _given(self, frame: int) -> Float32Array:
+        """Return the cue (H, W), m, NaN where it is not a depth."""
+        cue = self.sequence.depths[frame]
+        with np.errstate(invalid="ignore"):
+            return np.where(np.isfinite(cue) & (cue > 0.0), cue, np.float32(np.nan))
+
+    def final(self, frame: int) -> Float32Array:
+        """Return the depth (H, W) of a frame, m."""
+        mask = self.sequence.masks[frame]
+        if self.config.static == "nearest_points":
+            return self._by_nearest_points(frame, mask)
+        offsets = self.config.averaged_offsets
+        self.made = {number: made for number, made in self.made.items() if number >= frame - max(offsets, default=0)}
+        static, cue = self._static(frame)
+        poses: FloatArray = self.scene["world_T_cam"]
+        near = [frame + sign * offset for offset in offsets for sign in (-1, 1)]
+        averaged = average_over_frames(
+            np.exp(static.log_depth),
+            poses[frame],
+            (
+                (np.exp(self._static(other)[0].log_depth), poses[other], self._camera(other))
+                for other in near
+                if 0 <= other < len(poses)
+            ),
+            self._camera(frame),
+            self.config.averaged_sigmas * float(np.clip(np.nanmedian(static.sigma), 0.005, 0.03)),
+        ).depth
+        full = self._lifted(frame, np.log(averaged), cue)
+        if (mask > 0).any():
+            full = np.where(mask > 0, self._by_nearest_points(frame, mask), full)
+        return full
+
+    def _lifted(self, frame: int, log_depth: Float32Array, cue: Float32Array) -> Float32Array:
+        """Bring static depth to the size of the image: at edges by correcting the cue, which has the detail."""
+        if frame in self.broken:
+            return np.exp(self.size.enlarge(log_depth))
+        raw = self._given(frame)
+        with np.errstate(invalid="ignore"):
+            change = self.size.enlarge(log_depth - np.log(cue))
+            detailed = np.log(raw) + change
+            # Within a surface the coarse map is smooth, and has less noise than one frame's cue.
+            window = np.ones((3, 3), np.uint8)
+            filled = np.nan_to_num(log_depth, nan=-99.0)
+            range_ = cv2.dilate(filled, window) - cv2.erode(filled, window)
+            edge = np.clip(self.size.enlarge(range_.astype(np.float32)) / np.float32(_EDGE) - 1, 0, 1)
+            smooth = self.size.enlarge(log_depth)
+            blended = np.where(np.isfinite(smooth), (1 - edge) * np.nan_to_num(smooth) + edge * detailed, detailed)
+            # Beside missing depth nothing is known at working size: there the cue has its frame's usual error.
+            usual = np.log(raw) + np.float32(np.nanmedian(log_depth - np.log(cue)))
+            blended = np.where(np.isfinite(blended), blended, usual)
+        return np.exp(np.where(np.isfinite(raw), blended, np.float32(np.nan)))
+
+    def _by_nearest_points(self, frame: int, mask: Int32Array) -> Float32Array:
+        return densify_frame(
+            self._given(frame), mask, self.intrinsics[frame], self.control[frame],
+            float(self.scene["log_scale"][frame]), float(self.scene["noise"][1]), self.config,
+        )  # fmt: skip
+
+    def _static(self, frame: int) -> tuple[StaticDepth, Float32Array]:
         if frame not in self.made:
-            control = control_points(self.labelled, self.scene, self.motion, frame)
-            log_scale, sigma = float(self.scene["log_scale"][frame]), float(self.scene["noise"][1])
-            depth, mask = self.sequence.depths[frame], self.sequence.masks[frame]
-            dense = densify_frame(depth, mask, self.scene["intrinsics"], control, log_scale, sigma, self.config)
-            self.made[frame] = dense, mask == 0
+            broken = frame in self.broken
+            cue = self._carried(frame) if broken else self.size.depth(self._given(frame))
+            shown = self.multiview.shown.get(frame) or self._working_frame(frame)
+            measured = self.multiview.at(frame) if self.config.multiview.enabled else None
+            mine = self.control[frame]
+            usable = (mine.instance == 0) & np.isfinite(mine.log_scale)
+            uv = self.size.pixels(mine.uv[usable])
+            log_z = mine.log_scale[usable] + np.log(mine.cue[usable])
+            if not broken:
+                # The cue is read where the landmark is, between pixels: its error there holds for the pixel nearest.
+                column, row = np.clip(np.rint(uv), 0, (self.size.width - 1, self.size.height - 1)).astype(np.int64).T
+                nearest = cue[row, column]
+                log_z = np.where(np.isfinite(nearest), mine.log_scale[usable] + np.log(nearest), log_z)
+            static, log_scale = np.isfinite(shown.matched), float(self.scene["log_scale"][frame])
+            by_landmarks = known_depth(None, uv, log_z, static, cue.shape)
+            fused = fuse_static(cue, None, by_landmarks, log_scale, self.config)
+            if measured is not None:
+                known = known_depth(measured, uv, log_z, static, cue.shape)
+                # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
+                if known.landmark_spread < spread_at_landmarks(fused, by_landmarks):
+                    fused = fuse_static(cue, measured, known, log_scale, self.config)
+                    self.matched += 1
+            self.made[frame] = fused, cue
         return self.made[frame]
+
+    def _carried(self, frame: int) -> Float32Array:
+        """Return a frame's depth as the nearest frames with a sound cue show it, at working size."""
+        poses: FloatArray = self.scene["world_T_cam"]
+        near = [frame + sign * step for step in range(1, _CARRIED_REACH + 1) for sign in (-1, 1)]
+        sound = [other for other in near if 0 <= other < len(poses) and other not in self.broken][:_CARRIED_FROM]
+        others = [(np.exp(self._static(other)[0].log_depth), poses[other], self._camera(other)) for other in sound]
+        shape = (self.size.height, self.size.width)
+        return carried_depth(shape, poses[frame], others, self._camera(frame))
+
+    def _camera(self, frame: int) -> FloatArray:
+        """Return intrinsics (4,) at working size."""
+        return self.size.intrinsics(self.intrinsics[frame])
+
+    def _working_frame(self, frame: int) -> WorkingFrame:
+        return working_frame(
+            self.sequence.images[frame], self.sequence.masks[frame], self.size, self.config.multiview.mask_band_px
+        )
+
+    def _landmarks(self, frame: int) -> FloatArray:
+        points: FloatArray = self.control[frame].points[self.control[frame].instance == 0]
+        return points
+
+    def summary(self) -> dict[str, Any]:
+        """Return facts and warnings; after the last frame."""
+        out: dict[str, Any] = {"broken_frames": sorted(self.broken), "matched_frames": self.matched}
+        done = f"in {self.matched} of {self.sequence.num_frames} frames"
+        out["facts"] = [f"depth from several views {self.unmatched or done}"]
+        if self.broken:
+            out["warnings"] = [
+                f"the depth cue of {len(self.broken)} frame(s) contradicts what the other frames show; their depth was "
+                f"made without it: {some_of(sorted(self.broken))}"
+            ]
+        return out
 
 
 def control_points(labelled: LabelledTracks, scene: Arrays, motion: Arrays, frame: int) -> ControlPoints:
@@ -116,4 +273,4 @@ def control_points(labelled: LabelledTracks, scene: Arrays, motion: Arrays, fram
     cue = labelled.depth[track, frame].astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         log_scale = np.where(z > 0, np.log(np.maximum(z, 1e-9)) - np.log(cue), np.nan)
-    return ControlPoints(labelled.tracks.uv[track, frame].astype(np.float64), cue, log_scale, instance)
+    return ControlPoints(labelled.tracks.uv[track, frame].astype(np.float64), cue, log_scale, instance, points)

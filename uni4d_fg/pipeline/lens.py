@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.errors import Cancelled, DegenerateProblemError, SolverError
+from uni4d_fg.errors import Cancelled, ConfigError, DegenerateProblemError, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens
@@ -21,7 +21,7 @@ from uni4d_fg.pipeline.steps import STOPPED
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
-from uni4d_fg.slam.lens.tracks import ideal_tracks
+from uni4d_fg.slam.lens.tracks import ideal_tracks, unzoomed_tracks
 
 
 @dataclass(frozen=True)
@@ -30,39 +30,82 @@ class CameraModel:
 
     lens: Lens
     intrinsics: FloatArray
-    """(4,) px."""
+    """(4,) px, of the longest focal length."""
+    zoom: FloatArray | None = None
+    """(T,) focal length of each frame over that one; None where the camera does not zoom."""
 
     def apply(
         self, sequence: Sequence, labelled: LabelledTracks, config: Config
     ) -> tuple[Sequence, LabelledTracks, Config]:
-        """Return what the stages solve: a pinhole's sequence and tracks; intrinsics are held, as the lens is theirs."""
-        if self.lens.is_pinhole:
+        """Return what the stages solve: the sequence and tracks of a pinhole that does not zoom.
+
+        Intrinsics are held, as lens and zoom are theirs; those of a zoom are of its longest focal length.
+        """
+        if self.lens.is_pinhole and self.zoom is None:
             return sequence, labelled, config
+        ideal = ideal_tracks(labelled, self.intrinsics, self.lens)
+        if self.zoom is not None:
+            ideal = unzoomed_tracks(ideal, self.intrinsics, np.log(self.zoom))
         held = config.input.model_copy(update={"intrinsics": "fixed"})
         return (
             replace(sequence, intrinsics=self.intrinsics, lens=PINHOLE),
-            ideal_tracks(labelled, self.intrinsics, self.lens),
+            ideal,
             config.model_copy(update={"input": held}),
         )
 
 
 def is_sought(sequence: Sequence, config: Config) -> bool:
-    """Return whether the lens is estimated.
+    """Return whether the lens, or a zoom, is estimated.
 
     That needs the likelihood of energy 'map', Levenberg-Marquardt, and poses and intrinsics that may move. A lens that
     came with the sequence is taken as it is, unless a model is asked for.
     """
-    if config.camera.model == "auto" and not sequence.lens.is_pinhole:
+    model, zooms = config.camera.model, config.camera.zoom == "on"
+    if (model == "pinhole" and not zooms) or (model == "auto" and not sequence.lens.is_pinhole):
         return False
-    if config.camera.model == "pinhole" or config.input.intrinsics == "fixed" or config.input.poses != "estimate":
-        return False
-    return config.energy == "map" and config.solver == "lm" and config.bundle_adjustment.depth_prior
+    return _rules_it_out(config) is None
+
+
+def _rules_it_out(config: Config) -> tuple[str, str] | None:
+    """Return the setting with which no lens can be estimated, and the one that it needs; None if nothing does."""
+    needs = {
+        "input.intrinsics": (config.input.intrinsics, "free"),
+        "input.poses": (config.input.poses, "estimate"),
+        "energy": (config.energy, "map"),
+        "solver": (config.solver, "lm"),
+        "bundle_adjustment.depth_prior": (str(config.bundle_adjustment.depth_prior).lower(), "true"),
+    }
+    found = ((f"{name}={has}", f"{name}={wanted}") for name, (has, wanted) in needs.items() if has != wanted)
+    return next(found, None)
 
 
 def known_camera(sequence: Sequence, config: Config) -> CameraModel:
-    """Return the camera of a sequence whose lens is not estimated."""
-    lens = PINHOLE if config.camera.model == "pinhole" else sequence.lens
-    return CameraModel(lens, sequence.intrinsics)
+    """Return the camera of a sequence whose lens is not estimated.
+
+    Raises:
+        ConfigError: If a model is asked for whose parameters are neither given nor to be estimated.
+    """
+    ruled_out = _rules_it_out(config)
+    if ruled_out is not None:
+        has, wanted = ruled_out
+        check_parameters(sequence, config, f"with {has}", f"set {wanted}")
+        if config.camera.zoom == "on":
+            raise ConfigError(f"camera.zoom=on: with {has} no zoom is estimated; set {wanted}, or camera.zoom=auto")
+    return CameraModel(PINHOLE if config.camera.model == "pinhole" else sequence.lens, sequence.intrinsics)
+
+
+def check_parameters(sequence: Sequence, config: Config, where: str, remedy: str) -> None:
+    """Check that the parameters of a model that is asked for are known where the lens is not estimated.
+
+    Raises:
+        ConfigError: If they are not; says where that is, and the remedy.
+    """
+    model = config.camera.model
+    if model not in ("auto", "pinhole") and sequence.lens.is_pinhole:
+        raise ConfigError(
+            f"camera.model: the parameters of {model} came with no calibration, and {where} they are not estimated; "
+            f"give a calibration that has them (--intrinsics), {remedy}, or leave camera.model=auto"
+        )
 
 
 def lens_step(
@@ -78,7 +121,7 @@ def lens_step(
     try:
         found = calibrate_lens(labelled, sequence.image_size, sequence.intrinsics, config, sequence.lens, hooks, run)
     except (DegenerateProblemError, SolverError) as error:
-        if config.camera.model != "auto":
+        if config.camera.model != "auto" or config.camera.zoom == "on":
             raise
         found = LensCalibration(PINHOLE, sequence.intrinsics, note=f"no distortion was sought: {error}")
     except Cancelled as error:
@@ -88,10 +131,14 @@ def lens_step(
         "parameters": found.lens.padded,
         "intrinsics": found.intrinsics,
     }
+    zoom = found.zoom
+    if zoom is not None and zoom.zoom is not None:
+        arrays["zoom"] = zoom.zoom
     summary: dict[str, Any] = {
         "solves": [solve_dict(solve) for solve in found.solves],
         "facts": found.facts(),
         "camera_model": found.lens.model,
+        "warnings": [] if zoom is None else list(zoom.warnings),
         "candidates": [
             {
                 "camera_model": c.lens.model,
@@ -104,10 +151,16 @@ def lens_step(
             for c in found.candidates
         ],
     }
+    if zoom is not None:
+        summary["zoom"] = {
+            "evidence": zoom.evidence,
+            "focal_sigma": zoom.open_by if np.isfinite(zoom.open_by) else None,
+            "focal_px": None if zoom.zoom is None else (zoom.intrinsics[0] * zoom.zoom).tolist(),
+        }
     return StageRecord(arrays, summary)
 
 
 def found_camera(arrays: Mapping[str, npt.NDArray[Any]]) -> CameraModel:
     """Return the camera of a record of :func:`lens_step`."""
     model = list(PARAMETERS)[int(arrays["model"][0])]
-    return CameraModel(Lens.of(model, arrays["parameters"]), arrays["intrinsics"])
+    return CameraModel(Lens.of(model, arrays["parameters"]), arrays["intrinsics"], arrays.get("zoom"))

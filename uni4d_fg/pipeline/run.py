@@ -10,16 +10,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
+from uni4d_fg.frontend.sequence.bars import bars_note, without_bars
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.labels import label_tracks
+from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.optim.added_factors import FactorSource, fingerprints, with_additions
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem_io import save_stage_graph
@@ -36,6 +39,7 @@ from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
+from uni4d_fg.pipeline.repeats import Repeats
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
@@ -68,8 +72,11 @@ class _Run:
     """What is added to the stages."""
     imu: ImuSamples | None = None
 
-    def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord]) -> Arrays:
-        """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored."""
+    def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord], total: int | None = None) -> Arrays:
+        """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored.
+
+        ``total`` is the work that the stage reports itself, in units of its own.
+        """
         began = time.perf_counter()
         record = self.store.load(name, key) if self.resume else None
         resumed = record is not None
@@ -79,7 +86,7 @@ class _Run:
             self.store.discard(name)
             remove_graphs(self.folder, name)
             self.recorder.solved.clear()
-            self.reporter.begin(name.replace("_", " "), None)
+            self.reporter.begin(name.replace("_", " "), total)
             counter = iter(range(1, 1 << 30))
             hooks = Hooks(
                 on_iteration=lambda solve, _, energy: self.reporter.advance(
@@ -200,18 +207,30 @@ def _reconstruct(
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
     key = sequence_key(sequence, run.should_stop)
+    sequence = run.sequence = without_bars(sequence, look=config.input.black_bars == "auto")
     key, labelled = _labels(run, key)
     key = stage_key(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
-    key, camera = _camera(run, key, labelled)
-    fragments = FragmentSearch.of(sequence, labelled, config.bundle_adjustment.rejoin)
-    key, scene, motion = _stages(run, key, *camera.apply(sequence, labelled, config), windows, run_stage, fragments)
+    # What is added to stages, windows included, counts the frames of the video: none is left out there.
+    alone = config.input.repeated_frames == "auto" and not (windows or sources or imu is not None)
+    repeats = Repeats.of(sequence, labelled) if alone else None
+    solved, solved_tracks = sequence, labelled
+    if repeats is not None:
+        solved, solved_tracks = repeats.sequence(sequence), repeats.labelled(labelled)
+        summary.stages["tracks"]["facts"] = [*summary.stages["tracks"].get("facts", []), repeats.fact()]
+        key = stage_key(key, repeats.solved.tolist())
+    key, camera = _camera(run, key, solved, solved_tracks)
+    fragments = FragmentSearch.of(solved, solved_tracks, config.bundle_adjustment.rejoin)
+    key, scene, motion = _stages(run, key, *camera.apply(solved, solved_tracks, config), windows, run_stage, fragments)
+    if repeats is not None:
+        scene, motion = repeats.expanded(scene), repeats.expanded(motion)
     adjusted = summary.stages["bundle_adjustment"]
     adjusted["facts"] = [*adjusted.get("facts", []), *measured.facts]
     key = stage_key(key, config.fusion)
-    _fuse(run, key, labelled, scene, motion)
-    reconstruction = assemble(sequence, labelled, scene, motion, camera.lens)
+    zoom = camera.zoom if camera.zoom is None or repeats is None else camera.zoom[repeats.shown]
+    _fuse(run, key, labelled, scene, motion, zoom, camera.lens)
+    reconstruction = assemble(sequence, labelled, scene, motion, camera.lens, zoom)
     write_result(folder, reconstruction)
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
@@ -224,16 +243,16 @@ def _reconstruct(
     return summary
 
 
-def _camera(run: _Run, key: str, labelled: LabelledTracks) -> tuple[str, CameraModel]:
+def _camera(run: _Run, key: str, sequence: Sequence, labelled: LabelledTracks) -> tuple[str, CameraModel]:
     """Find the lens, where it is not given or ruled out; return the key so far and the camera."""
-    sequence, config = run.sequence, run.config
+    config = run.config
     if not is_sought(sequence, config):
         return key, known_camera(sequence, config)
     stages = stage_key(key, config.camera, config.bundle_adjustment, config.windows.calibration_sightings)
     # Without what users add to stages: the lens is found on some of the frames.
     found = run.step("lens", stages, lambda hooks: lens_step(sequence, labelled, config, hooks, run.recorder))
     camera = found_camera(found)
-    return key if camera.lens.is_pinhole else stages, camera
+    return key if camera.lens.is_pinhole and camera.zoom is None else stages, camera
 
 
 def _stages(
@@ -311,15 +330,24 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
         save_labels(run.folder.labels, labelled)
         counts = labelled.counts()
         facts = [", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())]
+        facts += bars_note(sequence.content, sequence.image_size)
         return StageRecord({"num_tracks": np.array(tracks.num_tracks)}, {"tracks": counts, "facts": facts})
 
     if run.resume and not _readable(lambda: load_labels(run.folder.labels)):
         run.store.discard("tracks")
-    run.step("tracks", key, compute)
+    run.step("tracks", key, compute, 2 * (sequence.num_frames - 1) if sequence.tracks is None else None)
     return key, load_labels(run.folder.labels)
 
 
-def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays) -> None:
+def _fuse(
+    run: _Run,
+    key: str,
+    labelled: LabelledTracks,
+    scene: Arrays,
+    motion: Arrays,
+    zoom: FloatArray | None,
+    lens: Lens,
+) -> None:
     expected = (run.sequence.num_frames, *run.sequence.image_size)
     stored = run.folder.depth
     if run.resume and not _readable(
@@ -328,12 +356,21 @@ def _fuse(run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: 
         run.store.discard("fusion")
 
     def compute(hooks: Hooks) -> StageRecord:
-        fuse_depth(
-            run.folder.depth, run.sequence, labelled, scene, motion, run.config.fusion, run.reporter, run.should_stop
+        summary = fuse_depth(
+            run.folder.depth,
+            run.sequence,
+            labelled,
+            scene,
+            motion,
+            run.config.fusion,
+            run.reporter,
+            run.should_stop,
+            zoom,
+            lens,
         )
-        return StageRecord({}, {})
+        return StageRecord({}, summary)
 
-    run.step("fusion", key, compute)
+    run.step("fusion", key, compute, run.sequence.num_frames)
 
 
 def _readable(read: Callable[[], ValueT], fits: Callable[[ValueT], bool] = lambda _: True) -> bool:

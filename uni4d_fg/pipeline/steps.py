@@ -13,6 +13,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
+from uni4d_fg.counted import counted
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.factors.variable_types import INTRINSICS
 from uni4d_fg.frontend.measurements.imu import ImuSamples
@@ -35,6 +36,7 @@ from uni4d_fg.slam.stages.local_scale import predict_log_scale
 from uni4d_fg.slam.stages.merging import FindFragments
 from uni4d_fg.slam.stages.nonrigid import solve_nonrigid
 from uni4d_fg.slam.stages.observations import Observations, observations_of
+from uni4d_fg.slam.stages.proximal import lift_noise
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise, StaticScene
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 
@@ -72,7 +74,9 @@ def camera_init_step(
     solver = StaticSceneSolver(config, run, hooks)
     result = solver.initialize(labelled, sequence.intrinsics, free_intrinsics=config.input.intrinsics == "free")
     stop_if_cancelled(result.windows)
-    facts = [f"{len(result.windows)} windows, {sum(len(w.iterations) for w in result.windows)} iterations in all"]
+    facts = [
+        f"{counted(len(result.windows), 'window')}, {sum(len(w.iterations) for w in result.windows)} iterations in all"
+    ]
     summary: dict[str, Any] = {
         "solves": [solve_dict(w) for w in result.windows],
         "facts": facts,
@@ -242,7 +246,10 @@ def nonrigid_step(
         "track": result.track,
         "instance": result.instance,
     }
-    facts.append(f"{len(result.track)} trajectories of {len(np.unique(result.instance))} instances")
+    facts.append(
+        f"{counted(len(result.track), 'trajectory', 'trajectories')} of "
+        f"{counted(len(np.unique(result.instance)), 'instance')}"
+    )
     summary: dict[str, Any] = {"solves": [solve_dict(s) for s in solves], "dropped": result.dropped, "facts": facts}
     if config.rigid_objects.enabled and timestamps is not None:
         objects, part, found = rigid_objects_part(
@@ -281,11 +288,18 @@ def correct_cue(
     config: Config,
 ) -> tuple[Observations, Cameras, StaticNoise, list[str]]:
     """Scale the cue at dynamic observations by what the static scene around them says."""
-    if not energy_of(config).is_likelihood or len(observations) == 0 or len(scene["landmarks"]) == 0:
+    likely = energy_of(config).is_likelihood
+    if not (likely or config.nonrigid.proximal_weight > 0) or len(observations) == 0 or len(scene["landmarks"]) == 0:
         return observations, cameras, noise, []
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
     static = static.select(np.isin(static.track, scene["landmark_track"]))
     _, row = static.rows()
+    if not likely:
+        sigma = lift_noise(static, scene["landmarks"][row], cameras)
+        if not np.isfinite(sigma):
+            return observations, cameras, noise, []
+        noise = replace(noise, depth_sigma=max(sigma, config.bundle_adjustment.min_depth_sigma))
+        return observations, cameras, noise, [f"moving points held near their lift, noise {100 * sigma:.1f} %"]
     z = world_to_camera(cameras.world_T_cam[static.frame], scene["landmarks"][row])[:, 2]
     measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
     neighbors, samples = config.nonrigid.local_scale_neighbors, config.nonrigid.local_scale_samples

@@ -19,6 +19,7 @@ from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.pipeline.assemble import write_result
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.leftovers import remove_leftovers
+from uni4d_fg.pipeline.lens import check_parameters
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
@@ -104,12 +105,14 @@ def stream_sequence(
 
     Raises:
         InputError: If a cue cannot be read, or the checkpoint does not fit.
+        ConfigError: If a camera model is asked for whose parameters are not given.
         DegenerateProblemError: If there is no frame.
         SolverError: If a window cannot be solved.
         OutputError: If a result cannot be written.
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    check_parameters(sequence, config, "in a stream", "find it with `uni4d-fg reconstruct`")
     with run_lock(run_dir):
         mark_run(run_dir)
         measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)

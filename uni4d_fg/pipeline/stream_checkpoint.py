@@ -26,8 +26,8 @@ from uni4d_fg.slam.stages.scene import StaticNoise
 Arrays = dict[str, npt.NDArray[Any]]
 
 _WINDOW = (
-    "frame", "bridged", "start", "pose", "log_scale", "covariance", "intrinsics", "intrinsics_covariance",
-    "landmark_track", "landmark",
+    "frame", "bridged", "start", "pose", "log_scale", "covariance", "log_scale_sigma", "intrinsics",
+    "intrinsics_covariance", "landmark_track", "landmark",
 )  # fmt: skip
 _OBSERVATIONS = ("track", "frame", "uv", "depth", "weight")
 _BOOK = ("track", "first_frame", "last_frame", "label", "votes", "disagreeing", "color")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from uni4d_fg.counted import counted
 from uni4d_fg.optim.summary import SolveSummary
 
 _MAX_CURVE_POINTS = 200
@@ -44,7 +45,9 @@ class RunSummary:
         """Return one screen of text."""
         out = [f"{self.sequence['name']}: {self.sequence['num_frames']} frames"]
         if self.cues:
-            out.append("cues: " + "; ".join(f"{cue} {source}" for cue, source in self.cues["sources"].items()))
+            sources = "; ".join(f"{cue} {source}" for cue, source in self.cues["sources"].items())
+            seconds = self.cues.get("seconds", 0.0)
+            out.append(f"cues: {sources}" + (f"; {seconds:.1f} s" if seconds else ""))
             out += [f"    {text}" for text in self.cues["facts"]]
         for name, stage in self.stages.items():
             resumed = " (resumed)" if stage.get("resumed") else ""
@@ -52,7 +55,7 @@ class RunSummary:
             for solve in stage.get("solves", [])[-1:]:
                 out.append(
                     f"    energy {solve['initial_energy']:.4g} -> {solve['final_energy']:.4g} in "
-                    f"{solve['num_iterations']} iterations, {solve['termination']}"
+                    f"{counted(solve['num_iterations'], 'iteration')}, {solve['termination']}"
                 )
             out += [f"    {text}" for text in stage.get("facts", [])]
             dropped = {reason: n for reason, n in stage.get("dropped", {}).items() if n}

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.counted import counted
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
@@ -243,7 +244,10 @@ def _joined_summary(arrays: Arrays, summaries: list[dict[str, Any]]) -> dict[str
     out: dict[str, Any] = {
         "solves": [solve for summary in summaries for solve in summary["solves"]],
         "dropped": dict(dropped),
-        "facts": [f"{len(arrays['track'])} trajectories of {len(np.unique(arrays['instance']))} instances"],
+        "facts": [
+            f"{counted(len(arrays['track']), 'trajectory', 'trajectories')} of "
+            f"{counted(len(np.unique(arrays['instance'])), 'instance')}"
+        ],
     }
     warnings = dict.fromkeys(text for summary in summaries for text in summary.get("warnings", []))
     if warnings:

@@ -37,6 +37,7 @@ _LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
 _OPTIONAL: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "pose_covariance": ("float64", ("T", 6, 6)),
     "intrinsics_covariance": ("float64", (4, 4)),
+    "zoom": ("float64", ("T",)),
     "lens_model": ("int64", (1,)),
     "lens_parameters": ("float64", (4,)),
     "object_instance": ("int32", ("J",)),
@@ -140,6 +141,8 @@ def _value_problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
         known = 0 <= int(arrays["lens_model"][0]) < len(PARAMETERS)
         if not known or not np.isfinite(arrays["lens_parameters"]).all():
             return "its camera model is unknown, or a distortion parameter is not finite"
+    if "zoom" in arrays and not (arrays["zoom"] > 0.0).all():
+        return "zoom must be positive"
     for name in _OPTIONAL:
         if name in arrays and np.isinf(arrays[name]).any():
             return f"{name} has an infinite value"

@@ -76,7 +76,7 @@ def reprojection_residuals(reconstruction: Reconstruction, labelled: LabelledTra
     row, frame, points, uv = row[seen], frame[seen], points[seen], uv[seen]
     is_dynamic = (np.arange(len(seen)) >= len(static_row))[seen]
     in_camera = world_to_camera(reconstruction.world_T_cam[frame], points)
-    intrinsics = reconstruction.intrinsics
+    intrinsics = reconstruction.frame_intrinsics[frame]
     error = uv - reconstruction.lens.real_pixels(intrinsics, np.asarray(project(intrinsics, in_camera)))
     return Residuals(row, frame, uv, error, in_camera[:, 2], is_dynamic)
 
@@ -94,7 +94,7 @@ def landmark_sigma(reconstruction: Reconstruction, residuals: Residuals) -> Floa
     sigma = _GAUSSIAN_MEDIAN * float(np.median(np.abs(residuals.error[static])))
     poses = reconstruction.world_T_cam[frame]
     x = world_to_camera(poses, reconstruction.landmarks[row])
-    fx, fy = reconstruction.intrinsics[:2]
+    fx, fy = reconstruction.frame_intrinsics[frame, :2].T
     g = 1.0 / np.maximum(x[:, 2], NEAR_PLANE)
     by_camera_point = np.zeros((len(row), 2, 3))
     by_camera_point[:, 0, 0], by_camera_point[:, 0, 2] = fx * g, -fx * x[:, 0] * g**2

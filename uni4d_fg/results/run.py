@@ -14,6 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
+import numpy as np
+
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
@@ -23,6 +25,7 @@ from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.preview import preview
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.results.summary_file import read_summary
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -60,6 +63,7 @@ class Run:
     Args:
         root: The run's folder.
         read_sequence: Opens the sequence of the run; called once, when it is first asked for.
+        unfinished: Take a run that is going on as well, with what its stages have found so far.
 
     Attributes:
         folder: The files of the run.
@@ -71,17 +75,27 @@ class Run:
             summary is damaged.
     """
 
-    def __init__(self, root: Path, read_sequence: SequenceReader | None = None) -> None:
+    def __init__(self, root: Path, read_sequence: SequenceReader | None = None, *, unfinished: bool = False) -> None:
         self.folder = folder = RunFolder(root)
         self._read_sequence = read_sequence
         if not root.is_dir():
             raise InputError(f"{root}: no such folder; give the folder of a run")
         if not (folder.reconstruction.is_file() and folder.summary.is_file()):
+            if unfinished and read_sequence is not None and (root / "stages").is_dir():
+                self._open_unfinished(read_sequence)
+                return
             if folder.config.is_file() or (root / "stages").is_dir():
                 raise InputError(f"{root}: the run is not finished; continue it with its command line and --resume")
             raise InputError(f"{root}: holds no run; give the folder that `uni4d-fg reconstruct` wrote (--out)")
         self.reconstruction: Reconstruction = load_reconstruction(folder.reconstruction)
         self.summary: dict[str, Any] = read_summary(folder.summary)
+
+    def _open_unfinished(self, read_sequence: SequenceReader) -> None:
+        sequence = read_sequence()
+        self._read_sequence = lambda: sequence
+        self.reconstruction, stage = preview(self.folder.root, self.folder.labels, sequence)
+        said = f"the run is not finished: this is what stage {stage.replace('_', ' ')} found; open it again later"
+        self.summary = {"sequence": {"name": sequence.name}, "warnings": [said]}
 
     def with_parts(self, **parts: Any) -> Run:
         """Return the run with other parts: attributes by name; an InputError stands for a part that is not there."""
@@ -117,6 +131,12 @@ class Run:
     def small_unit(self) -> tuple[float, str]:
         """Factor and unit for small lengths: millimeters where lengths are meters."""
         return (1000.0, "mm") if self.is_metric else (1.0, "units")
+
+    @property
+    def has_times(self) -> bool:
+        """Whether timestamps are seconds; those of images that came without times count frames."""
+        times = self.reconstruction.timestamps
+        return not np.array_equal(times, np.arange(len(times)))
 
     @property
     def num_frames(self) -> int:

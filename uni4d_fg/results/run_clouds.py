@@ -64,7 +64,7 @@ def static_cloud(run: Run, fusion: FusionConfig, max_frames: int = 0) -> tuple[C
         fusion = fusion.model_copy(update={"static_frame_stride": stride})
     masks = sequence.masks if sequence.masks is not None else _NoMasks(run.num_frames, sequence.image_size)
     cloud = clouds.static_cloud(
-        sequence.images, depth, masks, result.intrinsics, result.world_T_cam, fusion, lens=result.lens
+        sequence.images, depth, masks, result.frame_intrinsics, result.world_T_cam, fusion, lens=result.lens
     )
     return ColoredPoints.of(*cloud, np.zeros(len(cloud.points), np.int32)), "depth"
 
@@ -85,7 +85,7 @@ def moving_cloud(run: Run, frame: int, fusion: FusionConfig) -> ColoredPoints | 
             return None
         mask, here = sequence.masks[frame], depth[frame]
         keep = (mask > 0) & ~clouds.depth_edges(here, fusion.edge_relative_gradient)
-        camera = result.intrinsics, result.world_T_cam[frame], fusion.dynamic_stride, result.lens
+        camera = result.frame_intrinsics[frame], result.world_T_cam[frame], fusion.dynamic_stride, result.lens
         points, colors = clouds.lift(sequence.images[frame], here, keep, *camera)
         instance = clouds.lift(np.asarray(mask), here, keep, *camera).colors.astype(np.int32)
         return ColoredPoints.of(points, colors, instance)

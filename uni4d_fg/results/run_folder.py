@@ -81,6 +81,16 @@ class RunFolder:
         return self.root / "report.html"
 
     @property
+    def shared_page(self) -> Path:
+        """One page that plays the run (``.html``), where it was asked for."""
+        return self.root / "share.html"
+
+    @property
+    def films(self) -> Path:
+        """Folder of films and stills, where they were asked for."""
+        return self.root / "render"
+
+    @property
     def exports(self) -> Path:
         """Folder of the run in the formats of other programs, where they were asked for."""
         return self.root / "export"

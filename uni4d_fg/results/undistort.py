@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.errors import InputError
+from uni4d_fg.frontend.sequence.frames import ChangedFrames
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
 from uni4d_fg.geometry.lens import PINHOLE, Lens
@@ -74,23 +74,6 @@ class Undistortion:
         return replace(labelled, tracks=moved, weight=weight)
 
 
-@dataclass(frozen=True)
-class UndistortedFrames:
-    """A :class:`FrameSource` that undistorts each frame when it is read."""
-
-    source: FrameSource[Any]
-    undistort: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def __getitem__(self, frame: int) -> npt.NDArray[Any]:
-        return self.undistort(np.asarray(self.source[frame]))
-
-    def __iter__(self) -> Iterator[npt.NDArray[Any]]:
-        return (self[frame] for frame in range(len(self)))
-
-
 def undistorted(run: Run) -> Run:
     """Return a run without its lens; the run itself if it has none.
 
@@ -104,11 +87,11 @@ def undistorted(run: Run) -> Run:
         return run
     how = Undistortion.of(result.intrinsics, result.lens, result.image_size)
 
-    def smooth(source: FrameSource[Any]) -> UndistortedFrames:
-        return UndistortedFrames(source, lambda image: how.frame(image, cv2.INTER_LINEAR))
+    def smooth(source: FrameSource[Any]) -> FrameSource[Any]:
+        return ChangedFrames(source, lambda image: how.frame(np.asarray(image), cv2.INTER_LINEAR))
 
-    def nearest(source: FrameSource[Any]) -> UndistortedFrames:
-        return UndistortedFrames(source, lambda values: how.frame(values, cv2.INTER_NEAREST))
+    def nearest(source: FrameSource[Any]) -> FrameSource[Any]:
+        return ChangedFrames(source, lambda values: how.frame(np.asarray(values), cv2.INTER_NEAREST))
 
     parts: dict[str, Any] = {"reconstruction": replace(result, intrinsics=how.pinhole, lens=PINHOLE)}
     sequence = run.sequence

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 
@@ -60,6 +62,8 @@ class Reconstruction:
     """(4, 4) px^2, marginal; zero for entries that were held."""
     lens: Lens = PINHOLE
     """Distortion; the images are of this camera, the intrinsics those of its pinhole."""
+    zoom: FloatArray | None = None
+    """(T,) focal length of each frame over that of ``intrinsics``; None for a camera that does not zoom."""
     object_instance: Int32Array | None = None
     """(J,) mask ids of the moving instances that are rigid bodies; None, as all that follow, where none was sought."""
     object_reference: Int32Array | None = None
@@ -78,3 +82,16 @@ class Reconstruction:
     def num_frames(self) -> int:
         """Number of frames T."""
         return int(self.world_T_cam.shape[0])
+
+    @property
+    def frame_intrinsics(self) -> FloatArray:
+        """(T, 4) fx, fy, cx, cy of each frame, px."""
+        return zoomed(self.intrinsics, self.zoom, self.num_frames)
+
+
+def zoomed(intrinsics: FloatArray, zoom: FloatArray | None, num_frames: int) -> FloatArray:
+    """Return the intrinsics (T, 4) of frames whose focal lengths are ``zoom`` (T,) times that of (4,) ones, px."""
+    factor = np.ones((num_frames, 4))
+    if zoom is not None:
+        factor[:, :2] = zoom[:, None]
+    return intrinsics * factor

@@ -74,6 +74,11 @@ class LandmarkSystem {
   /// l = rows (count,), which may repeat and must be free. Returns the largest gradient entry over free landmarks.
   double add_to_landmarks(std::int64_t count, const std::int64_t* rows, const double* blocks, const double* gradients);
 
+  /// Add to the coupling E of the last linearization: blocks (count, 3, 7), J_l^T J of landmark rows[i] with the six
+  /// pose entries and the log-scale of frames[i]. Pairs may repeat, must be of free landmarks, and of a factor that the
+  /// problem has, be its weight 0: for others no storage is planned. Throws std::invalid_argument for any other pair.
+  void add_to_coupling(std::int64_t count, const std::int64_t* frames, const std::int64_t* rows, const double* blocks);
+
   /// Eliminate the landmarks of the last linearization.
   ///
   /// `hessian` is H_cc with everything that else reads the cameras; `reduced` becomes S with its gradient replaced
@@ -83,8 +88,9 @@ class LandmarkSystem {
   /// Whitened coupling (count, 3, n + 5) of free landmarks `rows` after a successful `reduce`: L^{-1} E^T over the core
   /// columns and the four intrinsics, then L^{-1} g_l, with V + damping D = L L^T.
   ///
-  /// With it the caller adds a coupling F of its own to E, for which no storage is planned here: the reduced system
-  /// changes by -(E_l V^{-1} F_l^T + F_l V^{-1} E_l^T + F_l V^{-1} F_l^T) and its right-hand side by F_l V^{-1} g_l.
+  /// With it the caller adds a coupling F to other variables to E, for which no storage is planned here: the reduced
+  /// system changes by -(E_l V^{-1} F_l^T + F_l V^{-1} E_l^T + F_l V^{-1} F_l^T) and its right-hand side by F_l V^{-1}
+  /// g_l.
   void whitened_coupling(std::int64_t count, const std::int64_t* rows, double* out);
 
   /// L^{-1} (count, 3, 3) of free landmarks `rows` after a successful `reduce`.

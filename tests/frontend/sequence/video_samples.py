@@ -53,12 +53,27 @@ def find_box(data: bytes, *names: bytes) -> list[tuple[int, int]]:
 
 def rotate(path: Path, degrees: int) -> Path:
     """Write a rotation flag into the track header of an MP4 file."""
+    return set_matrix(path, ROTATIONS[degrees])
+
+
+def set_matrix(path: Path, abcd: tuple[int, int, int, int]) -> Path:
+    """Write a display matrix into the track header of an MP4 file."""
     data = bytearray(path.read_bytes())
     start = find_box(bytes(data), b"moov", b"trak", b"tkhd")[-1][0]
     assert data[start + 8] == 0  # version
-    a, b, c, d = ROTATIONS[degrees]
+    a, b, c, d = abcd
     matrix = np.array([a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30], ">i4")
     data[start + 48 : start + 84] = matrix.tobytes()
+    path.write_bytes(data)
+    return path
+
+
+def set_pixel_aspect(path: Path, aspect: float) -> Path:
+    """Say in the track header of an MP4 file that pictures are shown wider than they are stored."""
+    data = bytearray(path.read_bytes())
+    start = find_box(bytes(data), b"moov", b"trak", b"tkhd")[-1][0]
+    width = int.from_bytes(data[start + 84 : start + 88], "big")
+    data[start + 84 : start + 88] = round(width * aspect).to_bytes(4, "big")
     path.write_bytes(data)
     return path
 

@@ -55,7 +55,12 @@ def truth_and_run(tmp_path: Path) -> tuple[Sequence, Reconstruction, Path]:
         image_size=SIZE,
         timestamps=np.arange(FRAMES) * 1.0,
         tracks=make_tracks(),
-        ground_truth=GroundTruth(poses, ArrayFrames(depth), np.array([10.0, 10, 5, 4]), points),
+        ground_truth=GroundTruth(
+            world_T_cam=poses,
+            depths=ArrayFrames(depth),
+            intrinsics=np.array([10.0, 10, 5, 4]),
+            track_points=points,
+        ),
     )
     # The estimate lives in a world that is turned, moved and half the size.
     turn = Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix()
@@ -87,6 +92,30 @@ def truth_and_run(tmp_path: Path) -> tuple[Sequence, Reconstruction, Path]:
         for frame in range(FRAMES):
             writer.write(frame, depth[frame] * 1.1)
     return sequence, reconstruction, folder.root
+
+
+def test_covariances_are_compared_with_the_errors(truth_and_run: tuple[Sequence, Reconstruction, Path]) -> None:
+    sequence, reconstruction, root = truth_and_run
+    file = RunFolder(root).reconstruction
+    assert evaluate_run(root, sequence).consistency is None
+    # The run's lengths are wrong by a factor: by the metric its poses err, with the scale as a gauge they are exact.
+    save_reconstruction(
+        file, dataclasses.replace(reconstruction, pose_covariance=np.tile(1e-6 * np.eye(6), (FRAMES, 1, 1)))
+    )
+    report = evaluate_run(root, sequence)
+    assert report.consistency is not None
+    metric, scaled = report.consistency
+    assert metric.mean > 100.0
+    assert scaled.mean < 1e-3
+    assert scaled.within_95 == 1.0
+    assert report.trajectory is not None
+    assert scaled.scale == pytest.approx(report.trajectory.scale, rel=1e-4)
+    text = format_report(report)
+    assert "Covariances of the cameras" in text
+    assert "100 % / 100 %" in text
+    unknown = dataclasses.replace(reconstruction, pose_covariance=np.full((FRAMES, 6, 6), np.nan))
+    save_reconstruction(file, unknown)
+    assert evaluate_run(root, sequence).missing["consistency"] == "the run's covariances are not determined"
 
 
 def test_an_exact_run_scores_zero(truth_and_run: tuple[Sequence, Reconstruction, Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -45,6 +46,15 @@ def test_rays_of_observed_pixels_meet_their_landmarks(source: Run, exported: Exp
     offset = np.concatenate(offsets)
     np.testing.assert_allclose(np.linalg.norm(offset, axis=1), seen.error, atol=1e-6)
     assert np.abs(np.median(offset, axis=0)).max() < 0.1
+
+
+def test_frame_numbers_are_not_told_as_seconds(source: Run, tmp_path: Path) -> None:
+    counted = dataclasses.replace(source.reconstruction, timestamps=np.arange(source.num_frames, dtype=np.float64))
+    assert source.has_times
+    export_run(source.with_parts(reconstruction=counted), ["nerfstudio"], tmp_path)
+    frames = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())["frames"]
+    assert all("timestamp" not in frame for frame in frames)
+    np.testing.assert_allclose([frame["time"] for frame in frames], np.linspace(0.0, 1.0, len(frames)))
 
 
 def test_frames_are_sorted_and_timed(source: Run, exported: Export) -> None:

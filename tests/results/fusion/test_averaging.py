@@ -13,10 +13,11 @@ HEIGHT, WIDTH = 120, 160
 NORMAL, DISTANCE = np.array([0.2, -0.1, 1.0]), 3.0
 
 
-def plane_depth(world_T_cam: np.ndarray) -> np.ndarray:
+def plane_depth(world_T_cam: np.ndarray, camera: np.ndarray = K) -> np.ndarray:
     """Depth (H, W) of the plane normal . x = distance."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
-    rays = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], axis=-1) @ world_T_cam[:3, :3].T
+    fx, fy, cx, cy = camera
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1) @ world_T_cam[:3, :3].T
     return (DISTANCE - NORMAL @ world_T_cam[:3, 3]) / (rays @ NORMAL)
 
 
@@ -35,13 +36,23 @@ def error(depth: np.ndarray, truth: np.ndarray) -> float:
 
 
 def average(maps: list[np.ndarray], poses: np.ndarray, bound: float = 0.08) -> np.ndarray:
-    others = [(maps[i], poses[i]) for i in range(9) if i != 4]
-    return average_over_frames(maps[4], poses[4], others, K, bound)
+    others = [(maps[i], poses[i], K) for i in range(9) if i != 4]
+    return average_over_frames(maps[4], poses[4], others, K, bound).depth
 
 
 def test_exact_maps_are_left_alone(poses: np.ndarray) -> None:
     maps = [plane_depth(pose).astype(np.float32) for pose in poses]
     assert np.abs(np.log(average(maps, poses) / maps[4])).max() < 1e-4
+
+
+def test_every_frame_has_its_own_focal_length(poses: np.ndarray) -> None:
+    narrow = K * np.array([1.5, 1.5, 1.0, 1.0])
+    maps = [plane_depth(pose).astype(np.float32) for pose in poses]
+    zoomed = [plane_depth(pose, narrow).astype(np.float32) for pose in poses]
+    others = [(zoomed[i], poses[i], narrow) for i in range(9) if i != 4]
+    result = average_over_frames(maps[4], poses[4], others, K, 0.08).depth
+    assert np.abs(np.log(result / maps[4])).max() < 1e-4
+    assert np.abs(np.log(average(zoomed, poses) / zoomed[4])).max() > 1e-3  # with the other's it would not be
 
 
 def test_noise_shrinks_with_the_number_of_frames(poses: np.ndarray, rng: np.random.Generator) -> None:
@@ -70,4 +81,15 @@ def test_what_is_missing_stays_missing(poses: np.ndarray) -> None:
 def test_a_frame_that_looks_the_other_way_changes_nothing(poses: np.ndarray, rng: np.random.Generator) -> None:
     depth = noisy(plane_depth(poses[4]), rng, 0.01)
     away = poses[4] @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    np.testing.assert_array_equal(average_over_frames(depth, poses[4], [(depth, away)], K, 10.0), depth)
+    averaged = average_over_frames(depth, poses[4], [(depth, away, K)], K, 10.0)
+    np.testing.assert_array_equal(averaged.depth, depth)
+    assert averaged.seeing.max() == 0
+
+
+def test_it_counts_who_sees_and_who_agrees(poses: np.ndarray) -> None:
+    maps = [plane_depth(pose).astype(np.float32) for pose in poses]
+    maps[2][:] *= 0.5
+    averaged = average_over_frames(maps[4], poses[4], [(maps[i], poses[i], K) for i in (2, 3, 5)], K, 0.05)
+    inner = (slice(30, 90), slice(40, 120))
+    assert averaged.seeing[inner].min() == 3
+    assert averaged.agreeing[inner].max() == averaged.agreeing[inner].min() == 2

@@ -28,7 +28,7 @@ def control_points(rng, truth, mask, log_scale, count=600, noise=0.0, outliers=0
     s = log_scale[y, x] + noise * rng.normal(size=count)
     s[rng.random(count) < outliers] += 0.8
     cue = truth[y, x] * np.exp(-log_scale[y, x])
-    return ControlPoints(uv, cue, s, mask[y, x])
+    return ControlPoints(uv, cue, s, mask[y, x], np.zeros((count, 3)))
 
 
 def relative_error(estimate: np.ndarray, truth: np.ndarray, where: np.ndarray) -> float:

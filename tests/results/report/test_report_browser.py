@@ -28,7 +28,7 @@ def test_a_browser_shows_it_without_the_network_on_a_phone_and_in_the_dark(writt
         assert page.title() == "room: reconstruction report"
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         sizes = page.evaluate("[...document.images].map(image => image.complete ? image.naturalWidth : 0)")
-        assert len(sizes) >= 19
+        assert len(sizes) >= 28
         assert min(sizes) > 0
         charts = page.evaluate(
             "[...document.querySelectorAll('svg[role=img]')].map(svg => svg.getBoundingClientRect().height)"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 from viewing_samples import NUM_FRAMES, copied, opened
 
+from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.results.chunks import chunks_of, even_order, spacing_of
 from uni4d_fg.results.clouds import read_ply
 from uni4d_fg.results.colors import (
     BRIDGED_AMBER,
@@ -20,11 +24,13 @@ from uni4d_fg.results.colors import (
     value_range,
 )
 from uni4d_fg.results.pictures.figure import thumbnail
+from uni4d_fg.results.pictures.splatting import look_at
 from uni4d_fg.results.run_clouds import ColoredPoints
+from uni4d_fg.results.view.camera_layer import spaced_cameras
 from uni4d_fg.results.view.coloring import ColorBy, Coloring, values_of
 from uni4d_fg.results.view.content import Limits, RunClouds
-from uni4d_fg.results.view.layers import spaced_cameras
-from uni4d_fg.results.view.trails import trail_segments
+from uni4d_fg.results.view.framing import FOV_RAD, first_view, subject_of
+from uni4d_fg.results.view.trails import step_segments
 
 
 def as_set(points: np.ndarray) -> set[tuple[float, ...]]:
@@ -42,19 +48,111 @@ def test_clouds_come_from_files_thinned_to_the_limit(finished_run: Path) -> None
     np.testing.assert_array_equal(cloud.points, again.points)
 
 
-def test_moving_clouds_know_their_instances(finished_run: Path) -> None:
+def test_moving_clouds_have_every_pixel_and_know_their_instances(finished_run: Path) -> None:
     run = opened(finished_run)
     assert run.sequence is not None
-    cloud = RunClouds(run, Limits()).dynamic(3)
+    cloud = RunClouds(run, Limits()).moving(3)
     points, _ = read_ply(run.folder.dynamic_cloud(3))
-    assert as_set(cloud.points) == as_set(points)
+    # The file has every second pixel in x and y.
+    assert as_set(points) <= as_set(cloud.points)
+    assert len(cloud.points) > 3 * len(points)
     assert set(cloud.instance.tolist()) == set(np.unique(run.sequence.masks[3]).tolist()) - {0}
     # Without the sequence the instance is that of the nearest trajectory, which is right for nearly all points.
-    alone = RunClouds(run.with_parts(sequence=None), Limits()).dynamic(3)
+    alone = RunClouds(run.with_parts(sequence=None), Limits()).moving(3)
     assert as_set(alone.points) == as_set(points)
     by_place = dict(zip(map(tuple, np.round(cloud.points, 4).tolist()), cloud.instance.tolist(), strict=True))
     same = [by_place[tuple(p)] == i for p, i in zip(np.round(alone.points, 4).tolist(), alone.instance, strict=True)]
     assert np.mean(same) > 0.9
+    thin = RunClouds(run, Limits(moving_points=50 * NUM_FRAMES)).moving(3)
+    assert len(thin.points) == 50
+
+
+def test_a_whole_frame_is_the_frame(finished_run: Path) -> None:
+    run = opened(finished_run)
+    assert run.sequence is not None
+    cloud = RunClouds(run, Limits()).whole_frame(2)
+    height, width = run.reconstruction.image_size
+    assert len(cloud.points) > 0.8 * height * width
+    camera = world_to_camera(run.reconstruction.world_T_cam[2], cloud.points.astype(np.float64))
+    pixel = np.rint(project(run.reconstruction.intrinsics, camera)).astype(int)
+    np.testing.assert_array_equal(run.sequence.images[2][pixel[:, 1], pixel[:, 0]], cloud.colors)
+    np.testing.assert_array_equal(run.sequence.masks[2][pixel[:, 1], pixel[:, 0]], cloud.instance)
+    assert len(RunClouds(run.with_parts(depth=None), Limits()).whole_frame(2).points) == 0
+
+
+def test_the_dense_cloud_is_the_static_scene_with_a_point_per_pixel(finished_run: Path) -> None:
+    run = opened(finished_run)
+    sparse, _ = RunClouds(run, Limits()).static()
+    dense = RunClouds(run, Limits()).dense_static()
+    assert dense is not None
+    assert len(dense.points) > 3 * len(sparse.points)
+    distance, _ = cKDTree(dense.points).query(sparse.points)
+    # As near as a pixel's footprint at the scene's depth of about 3 m: 3 m / 120 px.
+    assert np.median(distance) < 0.025
+    few = RunClouds(run, Limits(static_points=2000)).dense_static()
+    assert few is not None
+    assert 500 < len(few.points) <= 2000
+    assert RunClouds(run.with_parts(sequence=None), Limits()).dense_static() is None
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 3000), st.integers(40, 400), st.integers(0, 1000))
+def test_chunks_hold_every_point_once_in_its_place(count: int, limit: int, seed: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * [5.0, 1.0, 0.1]
+    chunks = list(chunks_of(points, limit))
+    rows = np.concatenate([chunk.rows for chunk in chunks])
+    np.testing.assert_array_equal(np.sort(rows), np.arange(count))
+    for chunk in chunks:
+        assert len(chunk.rows) <= limit
+        # What half precision holds exactly, off by half a step of a thousandth of the radius at most.
+        np.testing.assert_array_equal(chunk.points.astype(np.float16).astype(np.float32), chunk.points)
+        back = chunk.center + chunk.radius * chunk.points.astype(np.float64)
+        assert np.abs(back - points[chunk.rows]).max() <= 0.501 * chunk.radius / 1024
+    assert list(chunks_of(np.zeros((0, 3)))) == []
+
+
+def test_any_first_part_of_a_chunk_covers_it() -> None:
+    side = np.linspace(-1.0, 1.0, 64)
+    points = np.stack((*np.meshgrid(side, side), np.zeros((64, 64))), axis=-1).reshape(-1, 3)
+    order = even_order(points)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(points)))
+    at_random = np.random.default_rng(0).permutation(len(points))
+    for part in (64, 300):
+        gap, random_gap = (np.mean(cKDTree(points[o[:part]]).query(points)[0] ** 2) for o in (order, at_random))
+        assert gap < 0.8 * random_gap
+
+
+def test_points_are_as_large_as_their_spacing() -> None:
+    grid = np.stack(np.meshgrid(np.arange(30), np.arange(30), [0]), axis=-1).reshape(-1, 3) * 0.02
+    assert spacing_of(grid) == pytest.approx(0.02)
+    # Dense and sparse parts of one cloud get points of their own size.
+    both = np.concatenate((grid, grid * 5.0 + [10.0, 0.0, 0.0]))
+    sizes = sorted(chunk.diameter for chunk in chunks_of(both, 900))
+    assert sizes == pytest.approx([0.032, 0.16], rel=0.01)
+
+
+def test_the_first_view_has_the_subject_beside_the_panel(finished_run: Path) -> None:
+    result = opened(finished_run).reconstruction
+    subject = subject_of(result, 3.0)
+    known = result.dynamic_points[:, 0][np.isfinite(result.dynamic_points[:, 0]).all(axis=1)]
+    assert (known.min(axis=0) <= subject).all()
+    assert (subject <= known.max(axis=0)).all()
+    for aspect, low, high in ((16 / 9, 0.3, 0.5), (0.46, 0.45, 0.55)):
+        view = first_view(result, 3.0, aspect)
+        camera = np.linalg.inv(look_at(view.position, view.look_at, view.up))
+        x, y, z = (camera @ np.append(subject, 1.0))[:3]
+        half = np.tan(0.5 * FOV_RAD)
+        assert low < 0.5 + 0.5 * x / (z * half * aspect) < high
+        assert abs(y / (z * half)) < 0.2
+        # The first camera stands in the picture as well.
+        x, y, z = (camera @ np.append(result.world_T_cam[0, :3, 3], 1.0))[:3]
+        assert z > 0
+        assert abs(x / (z * half * aspect)) < 1
+        assert abs(y / (z * half)) < 1
+    still = dataclasses.replace(result, dynamic_points=np.full_like(result.dynamic_points, np.nan))
+    np.testing.assert_allclose(
+        subject_of(still, 3.0), result.world_T_cam[0, :3, 3] + 3.0 * result.world_T_cam[0, :3, 2]
+    )
 
 
 def test_a_run_without_clouds_gets_them_from_depth_or_not_at_all(finished_run: Path, tmp_path: Path) -> None:
@@ -67,35 +165,29 @@ def test_a_run_without_clouds_gets_them_from_depth_or_not_at_all(finished_run: P
     np.testing.assert_allclose(np.median(cloud.points, axis=0), np.median(points, axis=0), atol=0.02)
     bare = RunClouds(run.with_parts(depth=None), Limits())
     assert bare.static()[1] == "none"
-    assert len(bare.dynamic(0).points) == 0
+    assert len(bare.moving(0).points) == 0
 
 
 def test_an_unreadable_configuration_does_not_hinder_clouds(finished_run: Path, tmp_path: Path) -> None:
     copy = copied(finished_run, tmp_path)
     (copy / "config.yaml").write_text("field_of_the_future: 3\n")
-    assert len(RunClouds(opened(copy), Limits()).dynamic(0).points) > 0
+    assert len(RunClouds(opened(copy), Limits()).moving(0).points) > 0
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(1, 6), st.integers(1, 9), st.integers(0, 12), st.randoms(use_true_random=False))
-def test_trails_join_known_neighbors_up_to_the_frame(tracks: int, frames: int, length: int, random: object) -> None:
-    rng = np.random.default_rng(random.randrange(1 << 30))  # type: ignore[attr-defined]
+@given(st.integers(1, 6), st.integers(1, 9), st.integers(0, 1000))
+def test_trails_join_known_neighbors(tracks: int, frames: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
     points = rng.normal(size=(tracks, frames, 3))
     points[rng.random((tracks, frames)) < 0.3] = np.nan
     frame = int(rng.integers(frames))
-    colors = np.full((tracks, 3), 200, np.uint8)
-    ends, shades = trail_segments(points, colors, frame, length)
-    known = np.isfinite(points).all(axis=2)
-    expected = sum(
-        bool(known[k, t - 1] and known[k, t])
-        for k in range(tracks)
-        for t in range(max(1, frame - length + 1), frame + 1)
-    )
-    assert ends.shape == shades.shape == (expected, 2, 3)
-    assert np.isfinite(ends).all()
-    last = np.isclose(ends[:, None, 1], points[None, :, frame].astype(np.float32), atol=1e-6).all(axis=2).any(axis=1)
-    assert (shades[last, 1] == 200).all()
-    assert (shades[:, 0] < shades[:, 1]).all()
+    colors = rng.integers(0, 255, (tracks, 3)).astype(np.uint8)
+    ends, shades = step_segments(points, colors, frame)
+    rows = [k for k in range(tracks) if frame > 0 and np.isfinite(points[k, frame - 1 : frame + 1]).all()]
+    assert ends.shape == shades.shape == (len(rows), 2, 3)
+    for row, segment, shade in zip(rows, ends, shades, strict=True):
+        np.testing.assert_allclose(segment, points[row, frame - 1 : frame + 1], rtol=1e-6)
+        assert (shade == colors[row]).all()
 
 
 def test_colors_by_value_and_instance() -> None:
@@ -118,7 +210,7 @@ def test_every_coloring_covers_everything_and_says_what_it_means(finished_run: P
     assert coloring.landmarks().shape == run.reconstruction.landmark_color.shape
     assert coloring.trajectories(2).shape == run.reconstruction.dynamic_color.shape
     assert coloring.cameras().shape == (NUM_FRAMES, 3)
-    cloud = RunClouds(run, Limits()).dynamic(1)
+    cloud = RunClouds(run, Limits()).moving(1)
     assert coloring.cloud(cloud).shape == cloud.points.shape
     assert {"image": "video", "instance": "instance 1", "residual": "px", "uncertainty": "mm"}[
         by.value

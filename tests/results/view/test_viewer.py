@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -12,14 +13,16 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from viewing_samples import browser_page, copied, free_port, opened
+from viewing_samples import NUM_FRAMES, browser_page, copied, free_port, opened
 
 from uni4d_fg import optional
 from uni4d_fg.cli import main
 from uni4d_fg.errors import ConfigError, MissingDependencyError
+from uni4d_fg.results.view.content import Limits, RunClouds
 from uni4d_fg.results.view.server import check_address, is_own_page, viewer_server
 from uni4d_fg.results.view.viewer import Viewer
 
@@ -68,9 +71,18 @@ def test_what_is_no_run_is_refused_before_anything_is_started(
         assert error.count("\n") == 1
 
 
-def drawn(server: object, name: str) -> int:
-    """Number of points of a node of the scene."""
-    return len(server.scene._handle_from_node_name[name].points)  # type: ignore[attr-defined]
+def handle(server: Any, name: str) -> Any:
+    """The node of the scene of this name."""
+    return server.scene._handle_from_node_name[name]
+
+
+def visible(server: Any, prefix: str) -> list[str]:
+    """Names of the visible nodes directly below a node."""
+    nodes = server.scene._handle_from_node_name.items()
+    return sorted(
+        name.removeprefix(prefix) for name, node in nodes
+        if name.startswith(prefix) and "/" not in name.removeprefix(prefix) and node.visible
+    )  # fmt: skip
 
 
 def test_the_panel_drives_the_scene(finished_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,17 +96,77 @@ def test_the_panel_drives_the_scene(finished_run: Path, capsys: pytest.CaptureFi
         viewer.refresh()
         assert "frame 5" in panel.facts.content
         heads = run.reconstruction.dynamic_points[:, 5]
-        assert drawn(server, "/moving/points") == np.isfinite(heads).all(axis=1).sum()
-        assert drawn(server, "/static/landmarks") == len(run.reconstruction.landmarks)
+        assert len(handle(server, "/moving/points/00005/all").points) == np.isfinite(heads).all(axis=1).sum()
+        assert len(handle(server, "/static/landmarks/points").points) == len(run.reconstruction.landmarks)
+        assert not handle(server, "/static/landmarks").visible
         panel.color.value = "residual"
         viewer.refresh()
         assert "reprojection error" in panel.legend.content
+        assert handle(server, "/static/landmarks").visible
         ticks = iter(range(10))
         panel.play.value = True
         panel.frames_per_second.value = 60
         viewer.run_until(lambda: next(ticks) == 9)
         assert panel.frame.value == (5 + 9) % run.num_frames
+        viewer.step(0)
+        assert not panel.play.value
+        viewer.step(-2)
+        assert panel.frame.value == (5 + 9 - 2) % run.num_frames
     assert capsys.readouterr().out == ""
+
+
+def test_everything_is_sent_once_and_frames_only_show_and_hide(finished_run: Path) -> None:
+    run = opened(finished_run)
+    with viewer_server("127.0.0.1", free_port(), "a run") as server:
+        viewer = Viewer(server, run)
+        viewer.load()
+        dense = RunClouds(run, Limits()).dense_static()
+        assert dense is not None
+        names = server.scene._handle_from_node_name
+        chunks = [node for name, node in names.items() if re.fullmatch(r"/static/cloud/\d+/\d+", name)]
+        assert sum(len(node.points) for node in chunks) == len(dense.points)
+        for frame in range(NUM_FRAMES):
+            assert f"/cameras/current/{frame:05d}" in names
+        before, sent = set(names), []
+        queue = server._websock_server.queue_message
+        server._websock_server.queue_message = lambda message: (sent.append(message), queue(message))[1]
+        viewer.step(3)
+        server._websock_server.queue_message = queue
+        assert set(names) == before
+        kinds = {type(message).__name__ for message in sent}
+        assert kinds <= {"SetSceneNodeVisibilityMessage", "GuiUpdateMessage"}
+        assert visible(server, "/moving/cloud/") == visible(server, "/moving/points/") == ["00003"]
+        assert visible(server, "/moving/steps/") == ["00000", "00001", "00002", "00003"]
+        viewer.panel.history.value, viewer.panel.trail.value = 1, 2
+        viewer.refresh()
+        assert visible(server, "/moving/cloud/") == visible(server, "/moving/steps/") == ["00002", "00003"]
+
+
+def test_a_frame_that_stands_still_is_filled_in(finished_run: Path) -> None:
+    run = opened(finished_run)
+    with viewer_server("127.0.0.1", free_port(), "a run") as server:
+        viewer = Viewer(server, run)
+        end = time.monotonic() + 1.0
+        viewer.run_until(lambda: time.monotonic() > end)
+        assert handle(server, "/moving/full").visible
+        assert len(visible(server, "/moving/full/00000/")) >= 1
+        viewer.step(1)
+        assert not handle(server, "/moving/full").visible
+
+
+def test_colors_are_sent_without_positions(finished_run: Path) -> None:
+    run = opened(finished_run)
+    with viewer_server("127.0.0.1", free_port(), "a run") as server:
+        viewer = Viewer(server, run)
+        viewer.load()
+        chunk = next(
+            n for name, n in server.scene._handle_from_node_name.items() if name.startswith("/moving/cloud/00002/")
+        )
+        points, colors = chunk.points, chunk.colors.copy()
+        viewer.panel.color.value = "instance"
+        viewer.refresh()
+        assert chunk.points is points
+        assert (chunk.colors != colors).any()
 
 
 def test_axes_of_rigid_objects_follow_the_frame(finished_run: Path) -> None:
@@ -110,7 +182,7 @@ def test_axes_of_rigid_objects_follow_the_frame(finished_run: Path) -> None:
         assert not Viewer(server, run).panel.objects.visible
     with viewer_server("127.0.0.1", free_port(), "a run") as server:
         viewer = Viewer(server, run.with_parts(reconstruction=changed))
-        node = server.scene._handle_from_node_name["/moving/object_3"]
+        node = handle(server, "/moving/object_3")
         assert viewer.panel.objects.visible
         assert not node.visible
         viewer.panel.frame.value = 5

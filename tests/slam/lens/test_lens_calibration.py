@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,15 @@ import pytest
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
-from uni4d_fg.errors import DegenerateProblemError
+from uni4d_fg.errors import ConfigError, DegenerateProblemError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.pipeline.lens import is_sought, known_camera
+from uni4d_fg.pipeline.stream import stream_sequence
 from uni4d_fg.results.evaluate.run import evaluate_run
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
@@ -130,3 +133,26 @@ def test_a_stream_takes_a_known_lens(barrel: Sequence) -> None:
     assert np.abs(result.world_T_cam[:, :3, 3] - expected[:, :3, 3]).max() < 0.02
     assert result.lens == Lens("SIMPLE_RADIAL", (-0.2,))
     np.testing.assert_array_equal(result.intrinsics, truth.intrinsics)  # held: the lens belongs to them
+
+
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        ("input.intrinsics=fixed", "input.intrinsics=free"),
+        ("input.poses=fixed", "input.poses=estimate"),
+        ("solver=adam", "solver=lm"),
+        ("bundle_adjustment.depth_prior=false", "bundle_adjustment.depth_prior=true"),
+    ],
+)
+def test_a_model_that_is_neither_given_nor_estimated_is_refused(barrel: Sequence, change: str, remedy: str) -> None:
+    plain = dataclasses.replace(barrel, lens=PINHOLE)
+    asked = config("camera.model=radial", change)
+    assert not is_sought(plain, asked)
+    with pytest.raises(ConfigError, match=rf"of radial came with no .* with {change} .* set {remedy},"):
+        known_camera(plain, asked)
+    given = Lens("RADIAL", (-0.2, 0.0))
+    assert known_camera(dataclasses.replace(barrel, lens=given), asked).lens == given
+    with pytest.raises(ConfigError, match="in a stream they are not estimated"):
+        stream_sequence(plain, Path("nowhere"), asked)
+    for model in ("auto", "pinhole"):
+        assert known_camera(plain, config(f"camera.model={model}", change)).lens == PINHOLE

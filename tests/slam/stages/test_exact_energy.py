@@ -1,4 +1,4 @@
-"""The exact scorer equals sums written out in numpy, and does not see a rigid motion of the world."""
+"""The exact scorer and the loss of Adam equal sums written out in numpy; neither sees a rigid motion of the world."""
 
 from __future__ import annotations
 
@@ -8,17 +8,22 @@ import numpy as np
 import pytest
 from stage_samples import K, camera_path, hide, observe, shift, static_observations, static_points
 
-from uni4d_fg.config.solver import KernelConfig
-from uni4d_fg.config.stages import CameraMotionConfig, NonRigidConfig
+from uni4d_fg.config.adam import AdamConfig, AdamScheduleConfig
+from uni4d_fg.config.solver import KernelConfig, SolverConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig, NonRigidConfig
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable_types import DYNAMIC_POINT
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS
 from uni4d_fg.frontend.track_model import TrackLabel
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import camera_to_world, project, world_to_camera
+from uni4d_fg.optim.adam.runner import AdamRunner
+from uni4d_fg.optim.stage import Stage
 from uni4d_fg.pipeline.steps import paper_energy
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy
 from uni4d_fg.slam.stages.nonrigid import PointMesh, build_mesh, nonrigid_problem
 from uni4d_fg.slam.stages.observations import Observations, observations_of
+from uni4d_fg.slam.stages.proximal import proximal_term
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
 
 FRAMES, TRACKS = 6, 15
@@ -70,6 +75,19 @@ def relative_change(a: np.ndarray, b: np.ndarray, floor: float) -> float:
     return float(np.linalg.norm(a - b) / size)
 
 
+def camera_motion(poses: np.ndarray, normalization: Normalization) -> tuple[float, float]:
+    """E_rot and E_trans."""
+    floor = CameraMotionConfig()
+    rotation, translation = [], []
+    for t in range(1, FRAMES - 1):
+        turns = [se3.so3_log(poses[t + i - 1, :3, :3].T @ poses[t + i, :3, :3]) for i in range(2)]
+        steps = [poses[t + i, :3, 3] - poses[t + i - 1, :3, 3] for i in range(2)]
+        rotation.append(relative_change(turns[0], turns[1], floor.rotation_floor_rad))
+        translation.append(relative_change(steps[0], steps[1], floor.translation_floor_m))
+    reduce = np.mean if normalization == "mean" else np.sum
+    return float(reduce(rotation)), float(reduce(translation))
+
+
 def static_energy(
     world_T_cam: np.ndarray, landmarks: np.ndarray, observations: Observations, normalization: Normalization
 ) -> dict[str, float]:
@@ -90,16 +108,9 @@ def test_the_static_energy_written_out(
     assert energy["static_reprojection"] == pytest.approx(
         reprojection(landmarks[row], observations, poses, normalization), rel=1e-12
     )
-    floor = CameraMotionConfig()
-    rotation, translation = [], []
-    for t in range(1, FRAMES - 1):
-        turns = [se3.so3_log(poses[t + i - 1, :3, :3].T @ poses[t + i, :3, :3]) for i in range(2)]
-        steps = [poses[t + i, :3, 3] - poses[t + i - 1, :3, 3] for i in range(2)]
-        rotation.append(relative_change(turns[0], turns[1], floor.rotation_floor_rad))
-        translation.append(relative_change(steps[0], steps[1], floor.translation_floor_m))
-    reduce = np.mean if normalization == "mean" else np.sum
-    assert energy["camera_rotation"] == pytest.approx(reduce(rotation), rel=1e-9)
-    assert energy["camera_translation"] == pytest.approx(reduce(translation), rel=1e-9)
+    rotation, translation = camera_motion(poses, normalization)
+    assert energy["camera_rotation"] == pytest.approx(rotation, rel=1e-9)
+    assert energy["camera_translation"] == pytest.approx(translation, rel=1e-9)
     assert set(energy) == {"static_reprojection", "camera_rotation", "camera_translation"}
 
 
@@ -134,6 +145,20 @@ def dynamic(rng: np.random.Generator, poses: np.ndarray) -> tuple[State, PointMe
     return state.replace({DYNAMIC_POINT: disturbed}), mesh, observations, rows, cameras
 
 
+def point_motion(state: State, mesh: PointMesh, normalization: Normalization) -> tuple[float, float]:
+    """E_smooth and E_arap with their weights."""
+    points = np.full((*mesh.row.shape, 3), np.nan)
+    points[mesh.row >= 0] = state[DYNAMIC_POINT]
+    steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    steps = steps[np.isfinite(steps)]
+    changes = []
+    for first, second in mesh.pairs:
+        distance = np.sqrt(np.sum((points[first] - points[second]) ** 2, axis=1) + 1e-8)
+        changes += [abs(step) for step in np.diff(distance) if np.isfinite(step)]
+    reduce = np.mean if normalization == "mean" else np.sum
+    return 10.0 * float(reduce(steps)), 100.0 * float(reduce(changes))
+
+
 def dynamic_energy(
     state: State,
     mesh: PointMesh,
@@ -153,21 +178,13 @@ def test_the_dynamic_energy_written_out(
     dynamic: tuple[State, PointMesh, Observations, np.ndarray, Cameras], normalization: Normalization
 ) -> None:
     state, mesh, observations, rows, cameras = dynamic
-    points = np.full((*mesh.row.shape, 3), np.nan)
-    points[mesh.row >= 0] = state[DYNAMIC_POINT]
     energy = dynamic_energy(state, mesh, observations, rows, cameras, normalization)
     assert energy["dynamic_reprojection"] == pytest.approx(
         reprojection(state[DYNAMIC_POINT][rows], observations, cameras.world_T_cam, normalization), rel=1e-12
     )
-    steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
-    steps = steps[np.isfinite(steps)]
-    changes = []
-    for first, second in mesh.pairs:
-        distance = np.sqrt(np.sum((points[first] - points[second]) ** 2, axis=1) + 1e-8)
-        changes += [abs(step) for step in np.diff(distance) if np.isfinite(step)]
-    reduce = np.mean if normalization == "mean" else np.sum
-    assert energy["smoothness"] == pytest.approx(10.0 * reduce(steps), rel=1e-12)
-    assert energy["arap"] == pytest.approx(100.0 * reduce(changes), rel=1e-9)
+    smoothness, arap = point_motion(state, mesh, normalization)
+    assert energy["smoothness"] == pytest.approx(smoothness, rel=1e-12)
+    assert energy["arap"] == pytest.approx(arap, rel=1e-9)
     assert set(energy) == {"dynamic_reprojection", "smoothness", "arap"}
 
 
@@ -182,3 +199,44 @@ def test_the_dynamic_energy_does_not_see_a_rigid_motion(
         replace(cameras, world_T_cam=MOTION @ cameras.world_T_cam), normalization,
     )  # fmt: skip
     assert there == pytest.approx(here, rel=1e-9)
+
+
+def first_loss(stage: Stage, state: State) -> float:
+    """What Adam minimizes, before its first step."""
+    once = AdamScheduleConfig(max_iterations=1)
+    config = AdamConfig(precision="float64", bundle_adjustment=once, nonrigid=once)
+    _, summary = AdamRunner(config)(stage, state)
+    return summary.iterations[0].energy
+
+
+@pytest.mark.parametrize("normalization", NORMALIZATIONS)
+def test_the_loss_of_adam_in_stage_2_is_the_formula_of_the_paper(
+    static: tuple[np.ndarray, Observations], poses: np.ndarray, normalization: Normalization
+) -> None:
+    landmarks, observations = static
+    tracks, row = observations.rows()
+    state = Cameras(poses, K, np.zeros(FRAMES)).state(landmarks, tracks)
+    config = BundleAdjustmentConfig(depth_prior=False, camera_motion=CameraMotionConfig(), reprojection_kernel=NORM)
+    problem = bundle_adjustment_problem(
+        state, observations, StaticNoise(1.0, 1.0), config, state[INTRINSICS],
+        Freedom(poses=True, intrinsics=False), PaperEnergy(normalization),
+    )  # fmt: skip
+    expected = reprojection(landmarks[row], observations, poses, normalization) + sum(
+        camera_motion(poses, normalization)
+    )
+    assert first_loss(Stage("bundle_adjustment", problem, SolverConfig()), state) == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("normalization", NORMALIZATIONS)
+def test_the_loss_of_adam_in_stage_3_is_the_formula_of_the_paper(
+    dynamic: tuple[State, PointMesh, Observations, np.ndarray, Cameras], normalization: Normalization
+) -> None:
+    state, mesh, observations, rows, cameras = dynamic
+    energy = PaperEnergy(normalization)
+    problem = nonrigid_problem(state, mesh, observations, rows, cameras, NOISE, PAPER_NONRIGID, energy)
+    bound = proximal_term(observations, rows, cameras, 0.02, NonRigidConfig(proximal_weight=1.0), energy)
+    stage = Stage("nonrigid", problem.add(bound), SolverConfig(), bounds=frozenset({bound.name}))
+    seen = reprojection(state[DYNAMIC_POINT][rows], observations, cameras.world_T_cam, normalization)
+    expected = seen + sum(point_motion(state, mesh, normalization))
+    assert first_loss(stage, state) == pytest.approx(expected, rel=1e-8)
+    assert sum(stage.problem.energies(state, exact=True).values()) > 1.0001 * expected

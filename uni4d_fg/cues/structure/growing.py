@@ -26,6 +26,7 @@ from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import Termination
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, without_camera_motion
+from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
@@ -51,6 +52,8 @@ class GrowingScene:
     free_focal: bool
     prior_intrinsics: FloatArray
     should_stop: Callable[[], bool]
+    sigma_px: float | None = None
+    """Noise of the tracks, where it was measured; the configured one before."""
 
     @classmethod
     def empty(
@@ -118,6 +121,17 @@ class GrowingScene:
         self.triangulate(missing & visible)
         return True
 
+    def take_out(self, frames: IntArray) -> None:
+        """Take the poses of some frames back, and the points that no others hold."""
+        self.registered[frames] = False
+        self._judge()
+
+    def continue_from(self, other: GrowingScene) -> None:
+        """Take the cameras of a scene of the same frames, and triangulate what they see."""
+        self.world_T_cam, self.registered = other.world_T_cam.copy(), other.registered.copy()
+        self.intrinsics = other.intrinsics.copy()
+        self.triangulate(np.ones(self.num_tracks, dtype=bool))
+
     def triangulate(self, which: BoolArray) -> None:
         """Triangulate tracks (M,) from the frames that have a pose; what does not fit stays without a point."""
         settings = self.config.geometric_depth
@@ -128,14 +142,19 @@ class GrowingScene:
         self.position[rows] = np.where(fits[:, None], points.position, np.nan)
         self._judge()
 
-    def adjust(self) -> None:
+    def adjust(self, relative_decrease: float | None = None) -> None:
         """Refine all cameras, points and (from three frames on) the focal lengths; then judge all observations.
+
+        Args:
+            relative_decrease: Where to stop, see the solver's configuration; None takes that.
 
         Raises:
             Cancelled: If asked to stop.
             SolverError: If the system cannot be solved.
         """
-        stage, state, frames, rows = self._bundle()
+        stage, state, frames, rows = self.bundle()
+        if relative_decrease is not None:
+            stage = replace(stage, solver=stage.solver.model_copy(update={"relative_decrease": relative_decrease}))
         state, summary = run_stage(stage, state, Hooks(should_stop=self.should_stop))
         if summary.termination is Termination.CANCELLED:
             raise Cancelled("structure from motion stopped")
@@ -147,7 +166,7 @@ class GrowingScene:
 
     def focal_deviation(self) -> float:
         """Return the marginal standard deviation of the focal lengths, as a part of their value; 0 if held."""
-        stage, state, _, _ = self._bundle()
+        stage, state, _, _ = self.bundle()
         if not stage.problem.is_free(INTRINSICS):
             return 0.0
         marginals = camera_marginals(stage.problem, state, stage.solver, stage.problem.eliminated)
@@ -156,17 +175,23 @@ class GrowingScene:
         variance = np.diag(marginals.blocks(INTRINSICS, 1)[0])[:2]
         return float(np.sqrt(np.max(variance / self.intrinsics[:2] ** 2)))
 
-    def _bundle(self) -> tuple[Stage, State, IntArray, IntArray]:
-        """Return bundle adjustment as a stage, its start, and the frames (t,) and tracks (m,) that take part."""
+    def used(self) -> tuple[Observations, IntArray]:
+        """Return the observations that take part in bundle adjustment, and the track row of each."""
         self._judge()
-        frames = np.flatnonzero(self.registered)
         keep = self.good & self.registered[self.observations.frame]
         keep &= np.bincount(self.row[keep], minlength=self.num_tracks)[self.row] >= 2
-        used = self.observations.select(keep)
+        return self.observations.select(keep), self.row[keep]
+
+    def bundle(self, free_focal: bool | None = None) -> tuple[Stage, State, IntArray, IntArray]:
+        """Return bundle adjustment as a stage, its start, and the frames (t,) and tracks (m,) that take part."""
+        used, row = self.used()
+        frames = np.flatnonzero(self.registered)
+        if free_focal is None:
+            free_focal = self.free_focal and len(frames) >= self.config.geometric_depth.focal_min_frames
         position_of = np.full(len(self.registered), -1, dtype=np.int64)
         position_of[frames] = np.arange(len(frames))
         used = replace(used, frame=position_of[used.frame])
-        rows = np.unique(self.row[keep])
+        rows = np.unique(row)
         groups = {
             POSE: self.world_T_cam[frames],
             INTRINSICS: self.intrinsics[None],
@@ -177,27 +202,22 @@ class GrowingScene:
         problem = bundle_adjustment_problem(
             state,
             used,
-            StaticNoise(settings.reprojection_sigma_px, settings.depth_sigma),
+            StaticNoise(self.sigma_px or settings.reprojection_sigma_px, settings.depth_sigma),
             settings,
             self.prior_intrinsics[None],
-            Freedom(
-                poses=True, intrinsics=self.free_focal and len(frames) >= self.config.geometric_depth.focal_min_frames
-            ),
+            Freedom(poses=True, intrinsics=free_focal),
         )
         return Stage("bundle_adjustment", problem, settings.solver), state, frames, rows
 
-    def cost(self, frames: BoolArray) -> float:
-        """Return the mean truncated squared error, in [0, 1], over all observations in the given frames (T,).
+    def measure_noise(self) -> float:
+        """Let bundle adjustment weigh the tracks by their noise, and return that, px.
 
-        What has no point, or no pose, counts as fully wrong: so scenes with other points can be compared.
+        With a noise assumed too large, the prior on the focal lengths would have too much of a say.
         """
-        limit = self.config.geometric_depth.max_reprojection_px
-        error = np.where(self.registered[self.observations.frame], self.errors(), np.inf)[
-            frames[self.observations.frame]
-        ]
-        with np.errstate(invalid="ignore"):
-            ratio = np.where(np.isfinite(error), np.minimum(error / limit, 1.0), 1.0)
-        return float(np.mean(ratio**2))
+        settings = self.config.bundle_adjustment
+        sigma = robust_sigma(self.errors()[self.good] / np.sqrt(2.0))
+        self.sigma_px = float(np.clip(sigma, settings.min_reprojection_sigma_px, settings.reprojection_sigma_px))
+        return sigma
 
     def errors(self) -> FloatArray:
         """Return the reprojection error of every observation, (N,) px; infinite without a point or behind."""

@@ -10,14 +10,18 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
+from uni4d_fg.cues.structure.epipolar import epipolar_outliers
+from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
+from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.growth import CONVERGED, grow
+from uni4d_fg.cues.structure.hypotheses import Competition
+from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.progress import Reporter
-from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -39,8 +43,13 @@ class Structure:
     """Noise of the tracks (robust standard deviation of a reprojection residual)."""
     pair: FramePair
     """The two frames it started from."""
-    focal_deviation: float
-    """Standard deviation of the focal lengths, as a part of their value; 0 if they are held."""
+    focal: FocalInterval
+    """Focal lengths that explain the tracks as well."""
+    unexplained: float
+    """Part of the held-out observations of the first frames that their cameras leave unexplained, see
+    :func:`~uni4d_fg.cues.structure.judging.unexplained`."""
+    rivals: list[Rival]
+    """Starts that explain them nearly as well."""
 
 
 def structure_from_motion(
@@ -75,19 +84,32 @@ def structure_from_motion(
     if should_stop():
         raise Cancelled("structure from motion stopped")
     used = observations.select(spread_tracks(observations, image_size, settings.max_tracks))
-    pairs = rank_pairs(used, num_frames, intrinsics, settings, known_focal=not free_focal)
-    pairs = [pair for pair in pairs if pair.parallax_px >= settings.min_parallax_px]
-    scene, pair = _best_start(used, num_frames, intrinsics, pairs, config, free_focal, should_stop)
-    if scene is None or pair is None:
+    outlier = epipolar_outliers(used, num_frames, image_size, settings)[used.rows()[1]]
+    competition = Competition(used, outlier, num_frames, image_size, intrinsics, config, free_focal, should_stop)
+    hypotheses = competition.run()
+    if not hypotheses:
         return None
-    _grow(scene, num_frames, reporter, should_stop)
-    scene.adjust()
-    scene.triangulate(~np.isfinite(scene.position[:, 0]))
-    scene.adjust()
-    sigma = robust_sigma(scene.errors()[scene.good] / np.sqrt(2.0))
+    best = hypotheses[0]
+    scene = GrowingScene.empty(
+        used.select(competition.chosen(best.tracks)), num_frames, best.scene.intrinsics, config,
+        free_focal=free_focal, prior_intrinsics=intrinsics, should_stop=should_stop,
+    )  # fmt: skip
+    scene.continue_from(best.scene)
+    grow(scene, reporter)
+    scene.measure_noise()
+    scene.adjust(CONVERGED)
+    sigma = scene.measure_noise()
     poses = _bridge(scene.world_T_cam, scene.registered)
     track, points = _triangulate_all(observations, poses, scene)
-    return Structure(poses, scene.intrinsics, scene.registered, track, points, sigma, pair, scene.focal_deviation())
+    rivals = rivals_of(hypotheses, poses)
+    focal = focal_interval(scene, image_size)
+    if free_focal:
+        usual = np.array(settings.usual_focal) * max(image_size)
+        others = [rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]]
+        focal = focal.holding(others)
+    return Structure(
+        poses, scene.intrinsics, scene.registered, track, points, sigma, best.pair, focal, best.unexplained, rivals
+    )  # fmt: skip
 
 
 def rotations_only(observations: Observations, num_frames: int, intrinsics: FloatArray) -> FloatArray:
@@ -101,86 +123,6 @@ def rotations_only(observations: Observations, num_frames: int, intrinsics: Floa
             turn = fit_rotation(observations.uv[a], observations.uv[b], intrinsics).second_R_first
         poses[frame, :3, :3] = poses[frame - 1, :3, :3] @ turn.T
     return poses
-
-
-def _best_start(
-    observations: Observations,
-    num_frames: int,
-    intrinsics: FloatArray,
-    pairs: list[FramePair],
-    config: Config,
-    free_focal: bool,
-    should_stop: Callable[[], bool],
-) -> tuple[GrowingScene | None, FramePair | None]:
-    """Try pairs and focal lengths on a few frames; return the scene that explains the tracks best."""
-    best: tuple[float, GrowingScene, FramePair] | None = None
-    tried = [(pair, 1.0) for pair in pairs[: config.geometric_depth.tried_pairs]]
-    while tried:
-        pair, factor = tried.pop(0)
-        scene = GrowingScene.empty(
-            observations,
-            num_frames,
-            intrinsics * np.array([factor, factor, 1.0, 1.0]),
-            config,
-            free_focal=free_focal,
-            prior_intrinsics=intrinsics,
-            should_stop=should_stop,
-        )
-        cost = _trial(scene, pair)
-        if cost is not None and (best is None or cost < best[0]):
-            best = (cost, scene, pair)
-        if not tried and factor == 1.0 and best is not None and free_focal:
-            tried = [(best[2], other) for other in config.geometric_depth.focal_starts if other != 1.0]
-    return (None, None) if best is None else best[1:]
-
-
-def _trial(scene: GrowingScene, pair: FramePair) -> float | None:
-    """Start from a pair, add some frames between, and return how badly the scene explains their tracks.
-
-    None if the pair gives no points.
-    """
-    if scene.should_stop():
-        raise Cancelled("structure from motion stopped")
-    if scene.start(pair) < scene.config.geometric_depth.min_pose_points:
-        return None
-    between = np.unique(
-        np.linspace(pair.first, pair.second, scene.config.geometric_depth.trial_frames).astype(np.int64)
-    )
-    for frame in between.tolist():
-        if not scene.registered[frame]:
-            scene.register(frame)
-    scene.adjust()
-    scene.triangulate(~np.isfinite(scene.position[:, 0]))
-    scene.adjust()
-    frames = np.zeros(len(scene.registered), dtype=bool)
-    frames[between] = True
-    return scene.cost(frames)
-
-
-def _grow(scene: GrowingScene, num_frames: int, reporter: Reporter, should_stop: Callable[[], bool]) -> None:
-    """Add frames until no further one can be posed."""
-    settings = scene.config.geometric_depth
-    failed: set[int] = set()
-    adjusted = int(scene.registered.sum())
-    reporter.begin("structure from motion", num_frames)
-    while True:
-        if should_stop():
-            raise Cancelled("structure from motion stopped")
-        frame = scene.next_frame(failed)
-        count = int(scene.registered.sum())
-        if frame is None or count >= settings.growth * adjusted:
-            if count > adjusted:
-                scene.adjust()
-                scene.triangulate(~np.isfinite(scene.position[:, 0]))
-                adjusted = count
-                failed.clear()  # better points may now pose a frame that failed before
-                continue
-            break
-        if scene.register(frame):
-            reporter.advance(int(scene.registered.sum()), f"frame {frame}")
-        else:
-            failed.add(frame)
-    reporter.end()
 
 
 def _bridge(world_T_cam: FloatArray, registered: BoolArray) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.slam.stages.observations import Observations
 
 _COLUMNS, _ROWS = 12, 9
@@ -28,10 +28,7 @@ def spread_tracks(observations: Observations, image_size: tuple[int, int], count
     length = np.bincount(row, minlength=len(tracks))
     if len(tracks) <= count:
         return np.ones(len(observations), dtype=bool)
-    height, width = image_size
-    column = np.clip(observations.uv[:, 0] * _COLUMNS / width, 0, _COLUMNS - 1).astype(np.int64)
-    line = np.clip(observations.uv[:, 1] * _ROWS / height, 0, _ROWS - 1).astype(np.int64)
-    cell = (observations.frame * _ROWS + line) * _COLUMNS + column
+    cell = observations.frame * _ROWS * _COLUMNS + picture_cells(observations.uv, image_size)
     start = np.searchsorted(row, np.arange(len(tracks) + 1))
     order = np.argsort(-length, kind="stable")
     order = order[length[order] >= min(_MIN_OBSERVATIONS, int(length.max()))]
@@ -49,4 +46,13 @@ def spread_tracks(observations: Observations, image_size: tuple[int, int], count
                     break
         quota *= 2
     result: BoolArray = picked[row]
+    return result
+
+
+def picture_cells(uv: FloatArray, image_size: tuple[int, int]) -> IntArray:
+    """Return the part of the picture (N,) in which each pixel (N, 2) lies; ``image_size`` is (height, width)."""
+    height, width = image_size
+    column = np.clip(uv[:, 0] * _COLUMNS / width, 0, _COLUMNS - 1).astype(np.int64)
+    line = np.clip(uv[:, 1] * _ROWS / height, 0, _ROWS - 1).astype(np.int64)
+    result: IntArray = line * _COLUMNS + column
     return result

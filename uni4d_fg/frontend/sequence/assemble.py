@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -171,7 +171,13 @@ def as_sequence(video: Video) -> Sequence:
         tracks=video.tracks,
         lens=video.lens,
         ground_truth=video.ground_truth,
+        content=video.content,
     )
+
+
+def as_video(sequence: Sequence) -> Video:
+    """Return a sequence as a video that brings all its cues."""
+    return Video(**{field.name: getattr(sequence, field.name) for field in fields(Sequence)})
 
 
 def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
@@ -230,6 +236,11 @@ def _assemble_truth(
         depths = open_depth(files.true_depth, size, files.true_depth_units_per_meter)
         check_count(files.true_depth, len(depths), num_frames)
         depths[0]
+    masks = None
+    if files.true_masks is not None:
+        masks = open_masks(files.true_masks, size)
+        check_count(files.true_masks, len(masks), num_frames)
+        masks[0]
     truth = GroundTruth()
     if files.ground_truth is not None:
         truth = load_ground_truth(files.ground_truth, num_tracks, num_frames)
@@ -240,4 +251,4 @@ def _assemble_truth(
             # One camera cannot be compared with a zoom; the rest of the sequence is still of use.
             truth = GroundTruth()
     poses = None if files.true_poses is None else load_poses(files.true_poses, num_frames)
-    return replace(truth, world_T_cam=poses, depths=depths)
+    return replace(truth, world_T_cam=poses, depths=depths, masks=masks)

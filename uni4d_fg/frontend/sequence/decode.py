@@ -32,9 +32,18 @@ _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 
 def _cut_short(data: bytes) -> bool:
-    """Tell whether a PNG or JPEG lacks its end; some decoders fill the rest with gray and say nothing."""
+    """Tell whether a PNG or JPEG lacks its end.
+
+    Some decoders fill the rest with gray and say nothing; OpenCV's sets aside what a chunk of a PNG announces, up to
+    4 GB, before it finds that the file has less.
+    """
     if data.startswith(_PNG_SIGNATURE):
-        return b"IEND" not in data[-1024:]
+        at = len(_PNG_SIGNATURE)
+        while at + 8 <= len(data):
+            if data[at + 4 : at + 8] == b"IEND":
+                return False
+            at += 12 + int.from_bytes(data[at : at + 4], "big")  # length, name, checksum
+        return True
     if data.startswith(_JPEG_START):
         return data.rfind(_JPEG_END) < data.rfind(_JPEG_SCAN)
     return False
@@ -47,7 +56,7 @@ def _decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> npt.NDArray[Any]:
     if not data:
         raise SequenceProblem(path, "is empty", remedy)
     if _cut_short(data):
-        raise SequenceProblem(path, f"is cut short ({len(data)} bytes)", remedy)
+        raise SequenceProblem(path, f"is cut short or damaged ({len(data)} bytes)", remedy)
     _check_pixels(path, data)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -184,6 +184,29 @@ class SelectedFrames(LazyFrames[T]):
 
     def _read(self, frame: int) -> T:
         return self.source[int(self.frames[frame])]
+
+
+class ChangedFrames(LazyFrames[T]):
+    """The frames of another source, each changed when it is read.
+
+    Args:
+        source: T frames.
+        change: Makes one frame of one of the source.
+    """
+
+    def __init__(self, source: FrameSource[T], change: Callable[[T], T]) -> None:
+        self.source = source
+        self.change = change
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def where(self, frame: int) -> str:
+        """Return where the source has it from."""
+        return where_of(self.source, frame)
+
+    def _read(self, frame: int) -> T:
+        return self.change(self.source[frame])
 
 
 def where_of(source: FrameSource[Any], frame: int) -> str:

@@ -55,6 +55,7 @@ class SequenceFiles:
     true_poses: Path | None = None
     true_depth: Path | None = None
     true_depth_units_per_meter: float = 1000.0
+    true_masks: Path | None = None
     true_intrinsics: Path | None = None
     ground_truth: Path | None = None
     problems: tuple[SequenceProblem, ...] = ()

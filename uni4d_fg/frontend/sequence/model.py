@@ -51,6 +51,8 @@ class GroundTruth:
     """(T, 4, 4) camera to world, OpenCV axes, meters."""
     depths: FrameSource[Float32Array] | None = None
     """T maps (H, W), meters; NaN where unknown."""
+    masks: FrameSource[Int32Array] | None = None
+    """T label maps (H, W), 0 static; what really moves."""
     intrinsics: FloatArray | None = None
     """(4,) fx, fy, cx, cy, px."""
     track_points: FloatArray | None = None
@@ -59,6 +61,21 @@ class GroundTruth:
     """(J,) mask ids of the instances that move rigidly."""
     world_T_object: FloatArray | None = None
     """(J, T, 4, 4) their poses, meters; the origin and axes of an object's frame are arbitrary, but fixed to it."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """The part of the images that shows something; ``bottom`` and ``right`` are the first row and column behind it."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
 
 
 @dataclass(frozen=True)
@@ -91,6 +108,8 @@ class Video:
     initial_world_T_cam: FloatArray | None = None
     """(T, 4, 4)."""
     ground_truth: GroundTruth = field(default_factory=GroundTruth)
+    content: Content | None = None
+    """What lies between black bars; None where nobody has looked for any."""
 
     @property
     def num_frames(self) -> int:
@@ -130,6 +149,8 @@ class Sequence:
     lens: Lens = PINHOLE
     """What is known of its distortion; the pinhole where nothing is."""
     ground_truth: GroundTruth = field(default_factory=GroundTruth)
+    content: Content | None = None
+    """What lies between black bars; None where nobody has looked for any."""
 
     @property
     def num_frames(self) -> int:

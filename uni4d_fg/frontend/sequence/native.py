@@ -81,6 +81,7 @@ def find_native_files(root: Path, depth: str | None = None) -> SequenceFiles:
         initial_poses=existing(root / "world_T_cam_init.npy"),
         true_poses=existing(root / "c2w.npy"),
         true_depth=true_depth,
+        true_masks=existing(root / "masks_gt"),
         ground_truth=existing(root / "ground_truth.npz"),
         problems=tuple(problems),
         no_depth=no_depth,
@@ -102,6 +103,7 @@ def read_native(root: Path, depth: str | None = None) -> Sequence:
     ``world_T_cam_init.npy``    optional: (T, 4, 4) poses to start from
     ``c2w.npy``                 optional truth: (T, 4, 4) camera to world, OpenCV axes
     ``depth_gt/``               optional truth, like ``depth_cue/``; or ``depth_gt.npy``
+    ``masks_gt/``               optional truth, like ``masks/``: what really moves
     ``ground_truth.npz``        optional truth: intrinsics (4,), track_points (K, T, 3), and of rigid objects
                                 rigid_instance (J,) and world_T_object (J, T, 4, 4)
     ==========================  =========================================================================

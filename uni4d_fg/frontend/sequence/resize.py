@@ -6,14 +6,14 @@ lies at ``(u + 0.5) s - 0.5`` of the small one, where ``s`` is the ratio of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, ImageArray
-from uni4d_fg.frontend.sequence.frames import LazyFrames, T, where_of
+from uni4d_fg.frontend.sequence.frames import ChangedFrames, T
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 
@@ -55,35 +55,8 @@ def resize_nearest(array: T, size: tuple[int, int]) -> T:
     return array[np.ix_(rows, columns)]  # type: ignore[return-value]
 
 
-class ResizedFrames(LazyFrames[T]):
-    """Images or maps whose size is changed as they are read.
-
-    Args:
-        source: T images (H, W, 3) or maps (H, W).
-        size: New (height, width), px.
-        resize: Makes one frame of that size.
-    """
-
-    def __init__(
-        self, source: FrameSource[T], size: tuple[int, int], resize: Callable[[T, tuple[int, int]], T]
-    ) -> None:
-        self.source = source
-        self.size = size
-        self.resize = resize
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def where(self, frame: int) -> str:
-        """Return where the source has it from."""
-        return where_of(self.source, frame)
-
-    def _read(self, frame: int) -> T:
-        return self.resize(self.source[frame], self.size)
-
-
 def _maps(source: FrameSource[T] | None, size: tuple[int, int]) -> FrameSource[T] | None:
-    return None if source is None else ResizedFrames(source, size, resize_nearest)
+    return None if source is None else ChangedFrames(source, partial(resize_nearest, size=size))
 
 
 def resize_video(video: Video, max_size: int) -> Video:
@@ -98,7 +71,7 @@ def resize_video(video: Video, max_size: int) -> Video:
     truth = video.ground_truth
     return replace(
         video,
-        images=ResizedFrames(video.images, new_size, resize_image),
+        images=ChangedFrames(video.images, partial(resize_image, size=new_size)),
         image_size=new_size,
         depths=_maps(video.depths, new_size),
         masks=_maps(video.masks, new_size),
@@ -107,6 +80,7 @@ def resize_video(video: Video, max_size: int) -> Video:
         ground_truth=replace(
             truth,
             depths=_maps(truth.depths, new_size),
+            masks=_maps(truth.masks, new_size),
             intrinsics=None if truth.intrinsics is None else scale_intrinsics(truth.intrinsics, size, new_size),
         ),
     )

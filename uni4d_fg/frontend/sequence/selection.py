@@ -96,6 +96,7 @@ def _take(video: Video, frames: IntArray) -> Video:
         ground_truth=GroundTruth(
             world_T_cam=_of_poses(truth.world_T_cam, frames),
             depths=None if truth.depths is None else SelectedFrames(truth.depths, frames),
+            masks=None if truth.masks is None else SelectedFrames(truth.masks, frames),
             intrinsics=truth.intrinsics,
             track_points=points,
             rigid_instance=truth.rigid_instance,

@@ -43,8 +43,11 @@ def _has_tracks(folder: Path) -> bool:
 
 def is_uni4d_layout(root: Path) -> bool:
     """Tell whether ``root`` holds ``rgb/`` and a depth, mask or track folder as Uni4D's preprocessing makes them."""
-    if not (root / "rgb").is_dir():
-        return False
+    return (root / "rgb").is_dir() and has_uni4d_cues(root)
+
+
+def has_uni4d_cues(root: Path) -> bool:
+    """Tell whether ``root`` holds a depth, mask or track folder as Uni4D's preprocessing makes them."""
     return any(_has_depth(f) or _has_masks(f) or _has_tracks(f) for f in subfolders(root))
 
 

@@ -92,6 +92,8 @@ class _Validation:
             self._array("true poses", lambda path: load_poses(path, num_frames), files.true_poses)
         if files.true_depth is not None:
             self._depth("true depth", files.true_depth, files.true_depth_units_per_meter)
+        if files.true_masks is not None:
+            self._true_masks(files.true_masks)
         self._other_truth(num_frames, size)
 
     def _images(self, path: Path) -> None:
@@ -190,6 +192,12 @@ class _Validation:
                 f"{path}: {100 * float(np.mean(missing)):.0f} % of the depth is missing",
                 "check how the depth was exported, or use a denser depth cue",
             )
+
+    def _true_masks(self, path: Path) -> None:
+        frames = self.findings.attempt("true masks", lambda: assemble.open_masks(path, self.size))
+        if frames is not None:
+            self._pairing("true masks", path, frames)
+            scan_frames("true masks", frames, self.findings, lambda frame, mask: None)
 
     def _masks(self, path: Path | None) -> None:
         if path is None:

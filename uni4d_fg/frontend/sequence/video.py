@@ -13,6 +13,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.frontend.sequence.containers import is_container, missing_bytes
+from uni4d_fg.frontend.sequence.display import Display, display_of
 from uni4d_fg.frontend.sequence.frames import LazyFrames
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.reading import check_regular
@@ -26,7 +27,7 @@ _REMEDY = "re-encode the video, or extract its frames into rgb/"
 
 
 class VideoFrames(LazyFrames[ImageArray]):
-    """A video file as T images (H, W, 3) uint8 RGB, upright as the file's rotation flag says.
+    """A video file as T images (H, W, 3) uint8 RGB, as players show it: upright, unmirrored, with square pixels.
 
     Seeking in compressed video is not frame-exact, so frames are reached by decoding forwards: reading in
     order costs one decode per frame. Reading in reverse order decodes a block of frames at a time. On construction
@@ -39,7 +40,8 @@ class VideoFrames(LazyFrames[ImageArray]):
 
     Attributes:
         path: The video file.
-        size: (height, width), px.
+        display: How stored pictures are shown.
+        size: (height, width) as shown, px.
         frame_rate: Frames per second; None when the file does not say.
         times: (T,) seconds at which the frames are shown, strictly increasing (variable frame rates included); None
             when the file has no such times.
@@ -54,9 +56,14 @@ class VideoFrames(LazyFrames[ImageArray]):
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, ImageArray] = OrderedDict()
         self._capture: Any = cv2.VideoCapture()
+        self.display = Display()
         self._next = 0
         self._last = -1
         self._open()
+        samples = [float(self._capture.get(p)) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN)]
+        rotation = float(self._capture.get(cv2.CAP_PROP_ORIENTATION_META))
+        self.display = display_of(path, samples[0] / samples[1] if samples[1] > 0 else 0.0, rotation)
+        self._orient()
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self.frame_rate = rate if np.isfinite(rate) and rate > 0 else None
         first = self._advance_to(0)
@@ -78,6 +85,11 @@ class VideoFrames(LazyFrames[ImageArray]):
         if not self._capture.isOpened():
             self._check_complete(0)
             raise SequenceProblem(self.path, "cannot be opened as a video", _REMEDY)
+        self._orient()
+
+    def _orient(self) -> None:
+        """Leave to the decoder to turn pictures, unless they are mirrored, which it cannot."""
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1.0 if self.display.mirror is None else 0.0)
 
     def _check_complete(self, readable: int) -> None:
         """Raise InputError if the end of the file is missing; ``readable`` frames come before."""
@@ -110,7 +122,7 @@ class VideoFrames(LazyFrames[ImageArray]):
         if not decoded:
             return None
         self._next += 1
-        return np.ascontiguousarray(pixels[:, :, ::-1])
+        return self.display.apply(pixels[:, :, ::-1])
 
     def __len__(self) -> int:
         return self._length

@@ -41,19 +41,17 @@ def write_native(sequence: Sequence, root: Path) -> None:
     truth = sequence.ground_truth
     with atomic_folder(root) as folder:
         _write_images(sequence, folder / "rgb", names)
-        _write_depth(sequence.depths, folder / "depth_cue", names)
-        _write_masks(sequence.masks, folder / "masks", names, always_rgb=False)
-        save_npy(folder / "K.npy", intrinsics_matrix(sequence.intrinsics))
+        _write_cues(sequence, folder, names)
         times = "".join(f"{float(t)!r}\n" for t in sequence.timestamps)
         (folder / "timestamps.txt").write_text(times, encoding="utf-8")
-        if sequence.tracks is not None:
-            _write_native_tracks(sequence.tracks, folder / "tracks.npz")
         if sequence.initial_world_T_cam is not None:
             save_npy(folder / "world_T_cam_init.npy", sequence.initial_world_T_cam)
         if truth.world_T_cam is not None:
             save_npy(folder / "c2w.npy", truth.world_T_cam)
         if truth.depths is not None:
             _write_depth(truth.depths, folder / "depth_gt", names)
+        if truth.masks is not None:
+            _write_masks(truth.masks, folder / "masks_gt", names, always_rgb=False)
         more = {
             "intrinsics": truth.intrinsics,
             "track_points": truth.track_points,
@@ -63,6 +61,29 @@ def write_native(sequence: Sequence, root: Path) -> None:
         known = {name: array for name, array in more.items() if array is not None}
         if known:
             save_npz(folder / "ground_truth.npz", **known)
+
+
+def write_cues(sequence: Sequence, root: Path) -> None:
+    """Write the cues of a sequence alone, as the native layout has them, for images that lie elsewhere.
+
+    Args:
+        sequence: Whose depth, masks, intrinsics and tracks to write.
+        root: The folder to make: absent or empty.
+
+    Raises:
+        OutputError: As :func:`write_native`.
+        InputError: If a frame of ``sequence`` cannot be read; nothing is left.
+    """
+    with atomic_folder(root) as folder:
+        _write_cues(sequence, folder, _file_names(sequence))
+
+
+def _write_cues(sequence: Sequence, folder: Path, names: tuple[str, ...]) -> None:
+    _write_depth(sequence.depths, folder / "depth_cue", names)
+    _write_masks(sequence.masks, folder / "masks", names, always_rgb=False)
+    save_npy(folder / "K.npy", intrinsics_matrix(sequence.intrinsics))
+    if sequence.tracks is not None:
+        _write_native_tracks(sequence.tracks, folder / "tracks.npz")
 
 
 def write_uni4d(sequence: Sequence, root: Path) -> None:

@@ -5,7 +5,8 @@ Two frames are connected where the corners of one are found in the other
 change of exposure or a frame that shows nothing is bridged by the frames beside it, and a whip pan by the overlap of
 its frames. Across a dissolve every frame is connected with the next, but no corner lasts from one end of it to the
 other (:mod:`uni4d_fg.frontend.shots.survival`), and what lies between is a blend of both,
-``I_s = alpha A + beta B + c`` (both moved along with the camera).
+``I_s = alpha A + beta B + c`` (both moved along with the camera). In ordinary motion A and B show the same things, so
+that both together explain hardly more of a frame between them than one of them does; in a dissolve they do not.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ class _Search:
         a, b = cut.stop - 3, cut.start + 2
         if cut.stop != cut.start or a < 0 or b >= len(self.frames):
             return False
-        shares, _ = self.blend(a, b)
+        shares, _, _ = self.blend(a, b)
         return bool(shares[:2].max() < 0.25 and shares[2:].min() > 0.75)
 
     def dissolves(self) -> list[Cut]:
@@ -203,7 +204,7 @@ class _Search:
         a, b = span.first, span.last
         if self.connected(a, b)[0]:
             return None
-        shares, explained = self.blend(a, b)
+        shares, explained, gained = self.blend(a, b)
         # A flash within is neither side.
         shares = cv2.medianBlur(shares.astype(np.float32)[None], 5)[0].astype(np.float64)
         numbers = np.arange(a + 1, b)
@@ -218,6 +219,8 @@ class _Search:
         start = int(np.clip(np.floor((1.0 - _PURE - offset) / rate) + 1, stop, b))
         if stop == a + 1 and start >= b - 1:
             return None  # ordinary motion fades from one end of a span to the other like this
+        if start > stop and gained[stop - a - 1 : start - a - 1].max() < self.config.min_blend_gain:
+            return None
         is_whole = bool(shares[1] < 0.1 and shares[-2] > 0.9 and stop > a + 1 and start < b)
         off_center = abs(stop + start - a - b) / (b - a)
         quality = float(explained[mixed].mean())
@@ -230,14 +233,15 @@ class _Search:
             total = np.vstack((self.motion[t], [0.0, 0.0, 1.0])) @ total
         return total[:2]
 
-    def blend(self, a: int, b: int) -> tuple[FloatArray, FloatArray]:
+    def blend(self, a: int, b: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fit the frames between two as blends of them.
 
         Returns:
             shares: (b - a - 1,) of the second in each, 0 to 1.
             explained: (b - a - 1,) part of its variance that the blend explains.
+            gained: (b - a - 1,) how much more of it that is than one of the two explains.
         """
-        shares, explained = [], []
+        shares, explained, gained = [], [], []
         height, width = self.frames[a].size
         everywhere = np.full((height, width), 255, np.uint8)
         for s in range(a + 1, b):
@@ -258,6 +262,7 @@ class _Search:
             if valid.mean() < 0.2:
                 shares.append(0.0)
                 explained.append(0.0)
+                gained.append(0.0)
                 continue
             columns = np.stack((first - first.mean(), second - second.mean()), axis=1)
             right = middle - middle.mean()
@@ -265,8 +270,11 @@ class _Search:
             rest = right - columns @ weights
             alpha, beta = np.maximum(weights, 0.0)
             shares.append(beta / max(alpha + beta, 1e-9))
-            explained.append(1.0 - float(rest @ rest) / max(float(right @ right), 1e-9))
-        return np.array(shares), np.array(explained)
+            variance = max(float(right @ right), 1e-9)
+            explained.append(1.0 - float(rest @ rest) / variance)
+            alone = (columns.T @ right) ** 2 / np.maximum((columns**2).sum(axis=0), 1e-9) / variance
+            gained.append(explained[-1] - float(alone.max()))
+        return np.array(shares), np.array(explained), np.array(gained)
 
 
 def merged(cuts: list[Cut], distance: int) -> list[Cut]:

@@ -99,6 +99,7 @@ def simulate(config: SyntheticSceneConfig) -> Simulation:
         ground_truth=GroundTruth(
             world_T_cam=world_T_cam,
             depths=ArrayFrames(depths),
+            masks=ArrayFrames(masks),
             intrinsics=intrinsics,
             track_points=exact.points,
             rigid_instance=rigid_instance,

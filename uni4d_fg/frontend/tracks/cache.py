@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import numpy as np
 from uni4d_fg.arrays import ImageArray
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.frontend.sequence.bars import CroppedFrames
+from uni4d_fg.frontend.sequence.model import Content, FrameSource, Sequence, Video
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.tracks.first_views import refines
 from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
 from uni4d_fg.frontend.tracks.lucas_kanade import Progress, ShouldStop, track_grid
 
@@ -26,7 +29,7 @@ def cache_key(images: FrameSource[ImageArray], config: TrackingConfig, should_st
         Cancelled: If ``should_stop`` said so.
     """
     digest = hashlib.blake2b(digest_size=16)
-    digest.update(f"{TRACKER_VERSION} {len(images)} {config.model_dump_json()}".encode())
+    digest.update(f"{TRACKER_VERSION} {refines(config)} {len(images)} {config.model_dump_json()}".encode())
     for image in images:
         if should_stop is not None and should_stop():
             raise Cancelled("tracking stopped while looking for remembered tracks")
@@ -63,6 +66,12 @@ def load_or_track(
                 f"the sequence has {sequence.num_frames}"
             )
         return sequence.tracks
+    content = sequence.content
+    if content is not None and content != Content(0, sequence.image_size[0], 0, sequence.image_size[1]):
+        # An edge of a bar looks like a point that stands still: the tracker does not see any.
+        inner = replace(sequence, images=CroppedFrames(sequence.images, content), content=None)
+        tracks = load_or_track(inner, config, cache_dir, progress, should_stop)
+        return replace(tracks, uv=tracks.uv + np.array([content.left, content.top], np.float32))
     if cache_dir is None:
         return track_grid(sequence.images, config, progress, should_stop)
     path = cache_dir / f"tracks-{cache_key(sequence.images, config, should_stop)}.npz"

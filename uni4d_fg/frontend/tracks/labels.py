@@ -17,7 +17,7 @@ from uni4d_fg.config.cues import InputConfig, LabelConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel, Tracks
-from uni4d_fg.frontend.tracks.depth_sampling import sample_depth
+from uni4d_fg.frontend.tracks.depth_sampling import nearest_around, sample_depth
 from uni4d_fg.frontend.tracks.mask_certainty import UNCERTAIN, certain_labels
 
 _STATIC_ID = 0
@@ -55,6 +55,7 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
     shape = tracks.visible.shape
     found = np.full(shape, _NOT_SEEN, np.int32)
     depth = np.full(shape, np.nan, np.float32)
+    behind_an_edge = np.zeros(shape, np.bool_)
     for frame in range(num_frames):
         mask = np.asarray(sequence.masks[frame], np.int32)
         depth_map = sequence.depths[frame]
@@ -75,6 +76,10 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
             input_config.max_depth_m,
             config.max_depth_spread,
         )
+        behind_an_edge[seen, frame] = depth[seen, frame] > (
+            nearest_around(depth_map, uv, input_config.min_depth_m, config.depth_edge_px)
+            / (1.0 - config.depth_edge_step)
+        )
 
     mask_id, votes, agreeing = _majority(found)
     agreed = (votes > 0) & (votes - agreeing <= config.max_off_label_fraction * votes)
@@ -85,6 +90,7 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
     label[agreed & (mask_id == _STATIC_ID) & ~long_enough] = TrackLabel.SHORT_STATIC
     instance = np.where(label == TrackLabel.DYNAMIC, mask_id, 0).astype(np.int32)
 
+    depth[(label != TrackLabel.DYNAMIC)[:, None] & behind_an_edge] = np.nan
     weight = _weights(found, mask_id, agreed, config.band_weight)
     return LabelledTracks(tracks, label, instance, weight, depth)
 

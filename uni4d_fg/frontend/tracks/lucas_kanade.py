@@ -2,9 +2,10 @@
 
 A grid of query points is started in frames 0, ``query_interval``, 2 ``query_interval``, ... Two sweeps over
 the video follow them: one forwards, in which every grid joins as the sweep passes its frame, and one
-backwards. A step moves all live points of all grids at once, so that a sweep costs two optical-flow calls
-per pair of frames, however many grids there are, plus a short one per live grid for the drift check. Only
-the two images of the step are held, and for the drift check the gray query images of live points.
+backwards. A step moves all live points of all grids at once, however many grids there are, and then finds their first
+views (:mod:`uni4d_fg.frontend.tracks.first_views`), so that its errors do not add up; without refinement the step is
+checked backwards, and optionally for drift. Only the two images of the step are held, the first views of live points,
+and for the drift check their gray query images.
 
 A point that fails a check of :mod:`uni4d_fg.frontend.tracks.optical_flow` is lost, and not looked for again. Where the
 forward sweep leaves a cell of the image empty between two grids, a new point starts
@@ -24,6 +25,7 @@ from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.tracks.first_views import FirstViews, refines
 from uni4d_fg.frontend.tracks.optical_flow import has_not_drifted, move_points
 from uni4d_fg.frontend.tracks.reseeding import corners_of_empty_cells
 
@@ -131,6 +133,8 @@ class _LivePoints:
     points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     origins: list[tuple[_Queries, ImageArray]] = field(default_factory=list)
     """Where the points started, and the image there; only for the drift check."""
+    views: FirstViews | None = None
+    """Of the points, if they are refined."""
 
     def start(self, queries: _Queries, image: ImageArray, config: TrackingConfig) -> None:
         """Add points in the frame where they start."""
@@ -138,12 +142,19 @@ class _LivePoints:
             return
         self.track = np.concatenate((self.track, queries.tracks()))
         self.points = np.concatenate((self.points, queries.points))
+        if refines(config):
+            if self.views is None:
+                self.views = FirstViews(config)
+            self.views.add(image, queries.points)
         if config.max_drift_px is not None:
             self.origins.append((queries, image))
 
     def move(self, source: ImageArray, target: ImageArray, config: TrackingConfig) -> None:
         """Follow all points to the next image and forget those that are lost."""
-        kept, self.points = move_points(source, target, self.points, config)
+        if self.views is None:
+            kept, self.points = move_points(source, target, self.points, config)
+        else:
+            kept, self.points = self.views.follow(source, target, self.points)
         self.track = self.track[kept]
         if config.max_drift_px is None:
             return
@@ -157,6 +168,8 @@ class _LivePoints:
                 alive.append((queries, image))
         self.origins = alive
         self.track, self.points = self.track[keep], self.points[keep]
+        if self.views is not None:
+            self.views.select(keep)
 
 
 def _gray(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> ImageArray:

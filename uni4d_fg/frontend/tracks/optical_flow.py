@@ -30,18 +30,32 @@ def move_points(
     kept = np.zeros(len(points), np.bool_)
     if len(points) == 0:
         return kept, points
+    moved, ahead = steps_ahead(source, target, points, config)
+    candidate = np.flatnonzero(ahead)
+    survivors = candidate[comes_back(source, target, points[candidate], moved[candidate], config)]
+    kept[survivors] = True
+    return kept, moved[survivors]
+
+
+def steps_ahead(
+    source: ImageArray, target: ImageArray, points: Float32Array, config: TrackingConfig
+) -> tuple[Float32Array, BoolArray]:
+    """Return where points (N, 2) of ``source`` are in ``target``, and whether (N,) they are found inside of it."""
     moved, found = _flow(source, target, points, None, config)
     height, width = target.shape
     border = config.border_px
     inside = (moved >= border).all(axis=1) & (moved <= (width - 1 - border, height - 1 - border)).all(axis=1)
-    candidate = np.flatnonzero(found & inside)
-    if len(candidate) == 0:
-        return kept, moved[:0]
-    back, found_back = _flow(target, source, moved[candidate], None, config)
-    miss = np.linalg.norm(back - points[candidate], axis=1)
-    survivors = candidate[found_back & (miss <= config.forward_backward_px)]
-    kept[survivors] = True
-    return kept, moved[survivors]
+    return moved, np.asarray(found & inside)
+
+
+def comes_back(
+    source: ImageArray, target: ImageArray, points: Float32Array, moved: Float32Array, config: TrackingConfig
+) -> BoolArray:
+    """Return (N,) whether points (N, 2) that moved to (N, 2) are led back to where they came from."""
+    if len(points) == 0:
+        return np.zeros(0, np.bool_)
+    back, found = _flow(target, source, moved, None, config)
+    return np.asarray(found & (np.linalg.norm(back - points, axis=1) <= config.forward_backward_px))
 
 
 def has_not_drifted(

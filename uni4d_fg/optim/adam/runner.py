@@ -22,6 +22,7 @@ from uni4d_fg.optim.adam.parameters import Parameters
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage
 from uni4d_fg.optim.summary import IterationRecord, SolveSummary, Termination
+from uni4d_fg.optim.threads import current_limit
 from uni4d_fg.optional import import_torch
 
 
@@ -40,6 +41,9 @@ class AdamRunner:
     def __post_init__(self) -> None:
         if self.config.device == "cuda" and not self.torch.cuda.is_available():
             raise SolverError("adam.device is 'cuda', but PyTorch finds no GPU: set it to 'cpu' or 'auto'")
+        limit = current_limit()
+        if limit is not None:
+            self.torch.set_num_threads(limit)
 
     @property
     def device(self) -> str:
@@ -76,6 +80,7 @@ class AdamRunner:
         return solved, self._summary(stage, initial, solved, trace, seconds)
 
     def _adapted(self, stage: Stage, state: State) -> tuple[Stage, State]:
+        stage = stage.unbounded()
         if not self.config.scale_anchor:
             kept = tuple(batch for batch in stage.problem.batches if batch.factor_type is not scale_anchor)
             stage = replace(stage, problem=replace(stage.problem, batches=kept))

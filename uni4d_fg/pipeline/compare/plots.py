@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from uni4d_fg.arrays import FloatArray
-from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
+from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.geometry.alignment import align_trajectories
 from uni4d_fg.pipeline.compare.benchmark import Benchmark
-from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.pictures.figure import (
     GRID,
     INK,
@@ -22,7 +21,6 @@ from uni4d_fg.results.pictures.figure import (
     spread_frames,
     upright_axes,
 )
-from uni4d_fg.results.run_folder import RunFolder
 
 _COLORS = ("#0b6e4f", "#c8553d", "#3d5a98", "#b58900", "#7b4fa3")
 _DEPTH_FRAMES = 4
@@ -40,7 +38,7 @@ def draw_energies(path: Path, benchmarks: list[Benchmark], title: str) -> None:
     figure.suptitle(title, color=INK, fontsize=12, x=0.02, ha="left")
     for index, benchmark in enumerate(benchmarks):
         panel = figure.add_subplot(rows, columns, index + 1)
-        _style(panel, f"{benchmark.kind} from {benchmark.start}", "wall time [s]", "exact energy")
+        style_panel(panel, f"{benchmark.kind} from {benchmark.start}", "wall time [s]", "exact energy")
         for color, (name, performance) in zip(_COLORS * 9, benchmark.performances.items(), strict=False):
             curve = np.array(performance.curve)
             start = np.array([[curve[1:, 0].min(initial=1e-3), curve[0, 1]]])
@@ -65,7 +63,7 @@ def draw_paths(path: Path, poses: Mapping[str, FloatArray], truth: FloatArray | 
     figure = new_figure(11.0, 5.4)
     panels = [figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2)]
     for panel, (name, i, j) in zip(panels, (("Top view", 0, 1), ("Side view", 1, 2)), strict=True):
-        _style(panel, name, ("right [m]", "forward [m]")[i], ("forward [m]", "up [m]")[j - 1])
+        style_panel(panel, name, ("right [m]", "forward [m]")[i], ("forward [m]", "up [m]")[j - 1])
         if truth is not None:
             flat = (truth[known][:, :3, 3] - origin) @ axes.T
             panel.plot(flat[:, i], flat[:, j], color=INK, linewidth=1.2, linestyle=(0, (4, 2)), label="ground truth")
@@ -78,24 +76,28 @@ def draw_paths(path: Path, poses: Mapping[str, FloatArray], truth: FloatArray | 
     save_figure(path, figure)
 
 
-def draw_depths(path: Path, sequence: Sequence, runs: Mapping[str, Path]) -> None:
-    """Draw some frames as a strip: image, depth cue, fused depth of every solver; PNG.
+def draw_depths(path: Path, images: FrameSource[ImageArray], rows: Mapping[str, FrameSource[Float32Array]]) -> None:
+    """Draw some frames as a strip: image, then depth row by row in the colors of the first; PNG.
+
+    Args:
+        path: The file.
+        images: T images (H, W, 3), RGB.
+        rows: T depth maps each, of any size, by name.
 
     Raises:
         InputError: If a frame cannot be read.
         OutputError: If the file cannot be written.
     """
-    frames = spread_frames(sequence.num_frames, _DEPTH_FRAMES)
-    fused = {name: read_depth(RunFolder(folder).depth) for name, folder in runs.items()}
-    rows = {"depth cue": sequence.depths, **fused}
-    height, width = sequence.image_size
+    frames = spread_frames(len(images), _DEPTH_FRAMES)
+    height, width = images[0].shape[:2]
+    reference = next(iter(rows.values()))
     figure = new_figure(2.6 * len(frames) + 0.6, (2.6 * height / width + 0.12) * (len(rows) + 1))
     grid = figure.subplots(len(rows) + 1, len(frames), squeeze=False)
     for column, frame in enumerate(frames):
-        cue = np.asarray(sequence.depths[frame])
-        good = cue[np.isfinite(cue) & (cue > 0)]
+        first = np.asarray(reference[frame])
+        good = first[np.isfinite(first) & (first > 0)]
         low, high = np.quantile(good, (0.02, 0.98)) if good.size else (0.0, 1.0)
-        grid[0, column].imshow(sequence.images[frame])
+        grid[0, column].imshow(images[frame])
         grid[0, column].set_title(f"frame {frame}", fontsize=9, color=MUTED)
         for row, source in enumerate(rows.values(), start=1):
             depth = np.asarray(source[frame], dtype=np.float64)
@@ -109,7 +111,8 @@ def draw_depths(path: Path, sequence: Sequence, runs: Mapping[str, Path]) -> Non
     save_figure(path, figure)
 
 
-def _style(panel: Axes, title: str, label_x: str, label_y: str) -> None:
+def style_panel(panel: Axes, title: str, label_x: str, label_y: str) -> None:
+    """Give a panel the look of all figures."""
     panel.set_title(title, loc="left", fontsize=10, color=MUTED)
     panel.set_xlabel(label_x, color=INK, fontsize=9)
     panel.set_ylabel(label_y, color=INK, fontsize=9)

@@ -13,6 +13,7 @@ from uni4d_fg.pipeline.compare.markdown import markdown
 from uni4d_fg.pipeline.compare.plots import draw_depths, draw_energies, draw_paths
 from uni4d_fg.pipeline.compare.ratios import losses, stage_ratios
 from uni4d_fg.pipeline.compare.solvers import LM
+from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 
@@ -53,5 +54,6 @@ def draw_comparison(folder: Path, sequence: Sequence, comparison: Comparison, ru
     files = [folder / f"{what}.png" for what in ("energy", "trajectory", "depth")]
     draw_energies(files[0], comparison.benchmarks, title)
     draw_paths(files[1], poses, sequence.ground_truth.world_T_cam)
-    draw_depths(files[2], sequence, folders)
+    fused = {name: read_depth(RunFolder(run).depth) for name, run in folders.items()}
+    draw_depths(files[2], sequence.images, {"depth cue": sequence.depths, **fused})
     return files

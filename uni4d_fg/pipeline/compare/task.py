@@ -43,5 +43,5 @@ class TaskRecorder:
     def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
         """Solve a stage."""
         if stage.reads_free_variables:
-            self.tasks.append(Task(stage, state))
+            self.tasks.append(Task(stage.unbounded(), state))
         return self.run(stage, state, hooks)

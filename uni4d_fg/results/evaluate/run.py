@@ -14,6 +14,7 @@ from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.geometry.alignment import Similarity, align_first_pose, align_trajectories
 from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.evaluate.consistency import ConsistencyMetrics, evaluate_consistency
 from uni4d_fg.results.evaluate.depth import DepthReport, evaluate_depth
 from uni4d_fg.results.evaluate.points import PointMetrics, evaluate_points
 from uni4d_fg.results.evaluate.rigid_objects import ObjectReport, evaluate_objects
@@ -38,6 +39,9 @@ class EvaluationReport:
     trajectory: TrajectoryMetrics | None
     poses_without_truth: int
     """Frames left out of the trajectory scores because their true pose is unknown."""
+    consistency: tuple[ConsistencyMetrics, ...] | None
+    """Whether the errors of the poses are as large as their covariances say; one entry per gauge. None as
+    well, without a reason, where the run has no covariances."""
     depth: DepthReport | None
     """Of the run's fused depth."""
     depth_cue: DepthReport | None
@@ -55,6 +59,7 @@ class EvaluationReport:
         """Return plain Python values; a part that is absent is ``{"missing": reason}``."""
         parts: dict[str, Any] = {
             "trajectory": self.trajectory and self.trajectory.to_dict(),
+            "consistency": self.consistency and [metrics.to_dict() for metrics in self.consistency],
             "depth": self.depth and self.depth.to_dict(),
             "depth_cue": self.depth_cue and self.depth_cue.to_dict(),
             "landmarks": self.landmarks and [metrics.to_dict() for metrics in self.landmarks],
@@ -104,6 +109,7 @@ def evaluate_run(run_dir: Path, sequence: Sequence, *, max_depth_m: float = 70.0
         frames=reconstruction.num_frames,
         trajectory=trajectory,
         poses_without_truth=reconstruction.num_frames - (0 if trajectory is None else trajectory.poses),
+        consistency=part("consistency", lambda: _consistency(reconstruction, sequence)),
         depth=part("depth", lambda: _depth(folder, sequence, max_depth_m)),
         depth_cue=part("depth_cue", lambda: _depth(None, sequence, max_depth_m)),
         landmarks=part("landmarks", lambda: _landmarks(reconstruction, sequence, folder)),
@@ -115,6 +121,12 @@ def evaluate_run(run_dir: Path, sequence: Sequence, *, max_depth_m: float = 70.0
 
 def _pose_pairs(reconstruction: Reconstruction, sequence: Sequence) -> tuple[FloatArray, FloatArray]:
     """Return the estimated and true poses (F, 4, 4) of the F frames whose true pose is known."""
+    truth, known = _true_poses(sequence)
+    return reconstruction.world_T_cam[known], truth[known]
+
+
+def _true_poses(sequence: Sequence) -> tuple[FloatArray, BoolArray]:
+    """Return the true poses (T, 4, 4) and which of them (T,) are known."""
     truth = sequence.ground_truth.world_T_cam
     if truth is None:
         raise _Unavailable(NO_GROUND_TRUTH)
@@ -123,7 +135,25 @@ def _pose_pairs(reconstruction: Reconstruction, sequence: Sequence) -> tuple[Flo
     known = np.asarray(np.isfinite(truth).all(axis=(1, 2)))
     if not known.any():
         raise _Unavailable("no ground truth: every true pose is unknown")
-    return reconstruction.world_T_cam[known], truth[known]
+    return truth, known
+
+
+def _consistency(reconstruction: Reconstruction, sequence: Sequence) -> tuple[ConsistencyMetrics, ...] | None:
+    covariance = reconstruction.pose_covariance
+    if covariance is None:
+        return None
+    truth, known = _true_poses(sequence)
+    if not known[0]:
+        raise _Unavailable("the true pose of the first frame, to which covariances are relative, is unknown")
+    estimate = reconstruction.world_T_cam[known]
+    found = [
+        evaluate_consistency(estimate, truth[known], covariance[known], with_scale=with_scale)
+        for with_scale in (False, True)
+    ]
+    metrics = tuple(one for one in found if one is not None)
+    if not metrics:
+        raise _Unavailable("the run's covariances are not determined")
+    return metrics
 
 
 def _depth(folder: RunFolder | None, sequence: Sequence, max_depth_m: float) -> DepthReport:

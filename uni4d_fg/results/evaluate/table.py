@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from uni4d_fg.results.evaluate.consistency import ConsistencyMetrics
 from uni4d_fg.results.evaluate.depth import DepthReport
 from uni4d_fg.results.evaluate.points import PointMetrics
 from uni4d_fg.results.evaluate.rigid_objects import ObjectReport
@@ -17,6 +18,8 @@ def format_report(report: EvaluationReport) -> str:
     lines += _section("Camera trajectory", report, "trajectory", _trajectory_lines(report.trajectory))
     if report.trajectory is not None and report.poses_without_truth:
         lines.append(_row("frames without a true pose", str(report.poses_without_truth)))
+    if report.consistency is not None or "consistency" in report.missing:
+        lines += _section("Covariances of the cameras", report, "consistency", _consistency_lines(report.consistency))
     lines += _section("Depth, fused", report, "depth", _depth_lines(report.depth))
     lines += _section("Depth, cue", report, "depth_cue", _depth_lines(report.depth_cue))
     lines += _section("Landmarks", report, "landmarks", _point_lines(report.landmarks))
@@ -55,6 +58,17 @@ def _trajectory_lines(metrics: TrajectoryMetrics | None) -> list[str]:
     ]
     if metrics.degenerate != "none":
         lines.append(_row("alignment is degenerate", metrics.degenerate.replace("_", " ")))
+    return lines
+
+
+def _consistency_lines(results: tuple[ConsistencyMetrics, ...] | None) -> list[str]:
+    lines: list[str] = []
+    for metrics in results or ():
+        lines.append(f"  [{metrics.protocol}; 1 where covariances hold]")
+        lines.append(_row("mean / by the median", f"{metrics.mean:.2f} / {metrics.median:.2f}"))
+        lines.append(_row("rotations / positions alone", f"{metrics.rotation:.2f} / {metrics.position:.2f}"))
+        shares = f"{100 * metrics.within_95:.0f} % / {100 * metrics.within_99:.0f} %"
+        lines.append(_row("frames within 95 % / 99 % regions", shares))
     return lines
 
 

@@ -68,6 +68,7 @@ def colmap_model(
         image_size=reconstruction.image_size,
         intrinsics=reconstruction.intrinsics + np.concatenate((np.zeros(2), HALF_PIXEL)),
         lens=reconstruction.lens,
+        zoom=reconstruction.zoom,
         names=list(names),
         quaternions=np.roll(continuous_quaternions(cam_T_world[:, :3, :3]), 1, axis=1),
         translations=cam_T_world[:, :3, 3],

@@ -13,6 +13,7 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.slam.reconstruction import zoomed
 
 CAMERA_MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 """COLMAP's numbers of the models with fx, fy, cx, cy, of which the last two have four parameters more."""
@@ -20,7 +21,7 @@ CAMERA_MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """One camera, T images and P points, in COLMAP's conventions: world to camera, pixel centers at 0.5."""
+    """One camera (T with a zoom), T images and P points, as COLMAP has them: world to camera, pixel centers at 0.5."""
 
     image_size: tuple[int, int]
     """(height, width), px."""
@@ -45,6 +46,12 @@ class ColmapModel:
     uv: FloatArray
     """(N, 2) px."""
     lens: Lens = PINHOLE
+    zoom: FloatArray | None = None
+    """(T,) focal length of each image over that of the intrinsics: each then has a camera of its own."""
+
+    def camera_of(self, image: int) -> int:
+        """Return the number of an image's camera, from 1."""
+        return 1 if self.zoom is None else image + 1
 
     def index_in_image(self) -> IntArray:
         """Return the place of every observation in the list of its image, (N,)."""
@@ -64,29 +71,33 @@ class ColmapModel:
         return np.asarray(np.searchsorted(self.point, np.arange(len(self.points) + 1)))
 
 
-def camera_parameters(model: ColmapModel) -> tuple[str, FloatArray]:
-    """Return COLMAP's name of the camera model, and its numbers.
+def camera_parameters(model: ColmapModel) -> tuple[str, list[FloatArray]]:
+    """Return COLMAP's name of the camera model, and the numbers of each camera.
 
     SIMPLE_RADIAL and RADIAL have one focal length in COLMAP; with two, they are written as OPENCV.
     """
+    cameras = zoomed(model.intrinsics, model.zoom, 1 if model.zoom is None else len(model.zoom))
     if model.lens.is_pinhole:
-        return "PINHOLE", model.intrinsics
+        return "PINHOLE", list(cameras)
     name = "OPENCV_FISHEYE" if model.lens.is_fisheye else "OPENCV"
-    return name, np.concatenate([model.intrinsics, model.lens.padded])
+    return name, [np.concatenate([camera, model.lens.padded]) for camera in cameras]
 
 
 def write_binary(model: ColmapModel, folder: Path) -> None:
     """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``; the folder must exist. Raises OSError."""
     height, width = model.image_size
-    name, parameters = camera_parameters(model)
-    camera = struct.pack("<QiiQQ", 1, 1, CAMERA_MODELS[name], width, height)
-    (folder / "cameras.bin").write_bytes(camera + struct.pack(f"<{len(parameters)}d", *parameters.tolist()))
+    name, cameras = camera_parameters(model)
+    with open(folder / "cameras.bin", "wb") as stream:
+        stream.write(struct.pack("<Q", len(cameras)))
+        for number, parameters in enumerate(cameras, start=1):
+            stream.write(struct.pack("<iiQQ", number, CAMERA_MODELS[name], width, height))
+            stream.write(struct.pack(f"<{len(parameters)}d", *parameters.tolist()))
     record = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
     with open(folder / "images.bin", "wb") as stream:
         stream.write(struct.pack("<Q", len(model.names)))
         for row, seen in enumerate(model.of_image()):
             pose = (*model.quaternions[row].tolist(), *model.translations[row].tolist())
-            stream.write(struct.pack("<i7di", row + 1, *pose, 1))
+            stream.write(struct.pack("<i7di", row + 1, *pose, model.camera_of(row)))
             stream.write(model.names[row].encode() + b"\0" + struct.pack("<Q", len(seen)))
             observed = np.empty(len(seen), dtype=record)
             observed["uv"], observed["point"] = model.uv[seen], model.point[seen] + 1
@@ -105,14 +116,15 @@ def write_text(model: ColmapModel, folder: Path) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; the folder must exist. Raises OSError."""
     height, width = model.image_size
     with open(folder / "cameras.txt", "w", encoding="utf-8") as stream:
-        name, parameters = camera_parameters(model)
+        name, cameras = camera_parameters(model)
         stream.write("# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy, then the distortion\n")
-        stream.write(f"1 {name} {width} {height} {_numbers(parameters)}\n")
+        for number, parameters in enumerate(cameras, start=1):
+            stream.write(f"{number} {name} {width} {height} {_numbers(parameters)}\n")
     with open(folder / "images.txt", "w", encoding="utf-8") as stream:
         stream.write("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of X, Y, POINT3D_ID\n")
         for row, seen in enumerate(model.of_image()):
             pose = np.concatenate((model.quaternions[row], model.translations[row]))
-            stream.write(f"{row + 1} {_numbers(pose)} 1 {model.names[row]}\n")
+            stream.write(f"{row + 1} {_numbers(pose)} {model.camera_of(row)} {model.names[row]}\n")
             observed = zip(model.uv[seen].tolist(), (model.point[seen] + 1).tolist(), strict=True)
             stream.write(" ".join(f"{u!r} {v!r} {point}" for (u, v), point in observed) + "\n")
     pairs = np.stack((model.image + 1, model.index_in_image()), axis=1)

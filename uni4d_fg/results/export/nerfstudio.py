@@ -42,6 +42,13 @@ def write_nerfstudio(job: ExportJob) -> None:
             names, opengl_poses(result.world_T_cam), elapsed, result.timestamps.tolist(), strict=True
         )
     ]
+    if result.zoom is not None:
+        for frame, (fl_x, fl_y, _, _) in zip(frames, result.frame_intrinsics.tolist(), strict=True):
+            frame |= {"fl_x": fl_x, "fl_y": fl_y}
+    if not job.run.has_times:
+        # Seconds that are frame numbers would be a film of one frame a second.
+        for frame in frames:
+            del frame["timestamp"]
     cloud = static_cloud(job.run)
     write_ply(job.folder / "sparse_pc.ply", cloud.points, cloud.colors)
     job.facts.append(f"{len(names)} images, {len(cloud.points)} points to start from")

@@ -5,15 +5,16 @@ Entities, all below ``world`` (x right, y down, z forward, meters):
 | entity | content | time |
 |---|---|---|
 | `world/camera` | pose | per frame |
-| `world/camera/image` | pinhole (static), JPEG | per frame |
+| `world/camera/image` | pinhole (static, unless the camera zooms), JPEG | per frame |
 | `world/camera_path` | path of the camera center | static |
 | `world/static` | static cloud | static |
 | `world/dynamic` | cloud of what moves | per frame |
 | `world/trajectories` | the last steps of every moving point that is there | per frame |
 | `world/object_ID` | pose and axes of a rigid object, where it has one | per frame |
 
-Every frame has a place on the time lines ``frame`` (its number) and ``time`` (seconds since the first). rerun puts
-pixel centers at 0.5 (https://github.com/rerun-io/rerun/issues/3896): 0.5 is added to cx and cy.
+Every frame has a place on the time lines ``frame`` (its number) and, where the video has times, ``time`` (seconds
+since the first). rerun puts pixel centers at 0.5 (https://github.com/rerun-io/rerun/issues/3896): 0.5 is added to cx
+and cy.
 """
 
 from __future__ import annotations
@@ -65,17 +66,21 @@ def _blueprint() -> Any:
 def _log_static(rerun: Any, recording: Any, job: ExportJob) -> None:
     """Log what does not change with time."""
     result = job.run.reconstruction
-    height, width = result.image_size
-    matrix = intrinsics_matrix(result.intrinsics)
-    matrix[:2, 2] += 0.5
     cloud = static_cloud(job.run)
     recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
-    pinhole = rerun.Pinhole(image_from_camera=matrix, resolution=[width, height], camera_xyz=rerun.ViewCoordinates.RDF)
-    recording.log(IMAGE, pinhole, static=True)
+    if result.zoom is None:
+        recording.log(IMAGE, _pinhole(rerun, result, 0), static=True)
     recording.log("world/static", _points(rerun, cloud.points, cloud.colors), static=True)
     path = rerun.LineStrips3D([result.world_T_cam[:, :3, 3].astype(np.float32)], colors=[[230, 60, 40]])
     recording.log("world/camera_path", path, static=True)
     job.figures["static_points"] = len(cloud.points)
+
+
+def _pinhole(rerun: Any, result: Reconstruction, frame: int) -> Any:
+    height, width = result.image_size
+    matrix = intrinsics_matrix(result.frame_intrinsics[frame])
+    matrix[:2, 2] += 0.5
+    return rerun.Pinhole(image_from_camera=matrix, resolution=[width, height], camera_xyz=rerun.ViewCoordinates.RDF)
 
 
 def _log_frames(rerun: Any, recording: Any, job: ExportJob) -> None:
@@ -85,9 +90,12 @@ def _log_frames(rerun: Any, recording: Any, job: ExportJob) -> None:
     palette = instance_colors(result.dynamic_instance)
     for frame in range(run.num_frames):
         recording.set_time("frame", sequence=frame)
-        recording.set_time("time", duration=float(result.timestamps[frame] - result.timestamps[0]))
+        if job.run.has_times:
+            recording.set_time("time", duration=float(result.timestamps[frame] - result.timestamps[0]))
         pose = result.world_T_cam[frame]
         recording.log(CAMERA, rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        if result.zoom is not None:
+            recording.log(IMAGE, _pinhole(rerun, result, frame))
         jpeg = encode(run.need_sequence().images[frame], ".jpg", Path(f"frame {frame}"))
         recording.log(IMAGE, rerun.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         cloud = moving_cloud(run, frame)

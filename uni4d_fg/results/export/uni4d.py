@@ -43,7 +43,8 @@ def write_uni4d_results(job: ExportJob) -> None:
         filled += missing
         with np.errstate(divide="ignore"):
             disparity = np.where(dense > 0.0, np.float32(1.0) / dense, np.float32(0.0))
-        save_npz(experiment / f"{frame:04d}.npz", disp=disparity, img=image, R=pose[:3, :3], t=pose[:3, 3], K=matrix)
+        here = intrinsics_matrix(result.frame_intrinsics[frame]).astype(np.float32)
+        save_npz(experiment / f"{frame:04d}.npz", disp=disparity, img=image, R=pose[:3, :3], t=pose[:3, 3], K=here)
         job.advance(frame + 1)
     _write_fused(job, experiment / "fused_4d.npz", matrix)
     truth = run.need_sequence().ground_truth
@@ -58,7 +59,9 @@ def write_uni4d_results(job: ExportJob) -> None:
     job.facts.append(f"{result.num_frames} frames and fused_4d.npz in {experiment.relative_to(job.folder)}")
     if filled:
         share = filled / (result.num_frames * result.image_size[0] * result.image_size[1])
-        job.facts.append(f"{100 * share:.1f} % of the pixels have no depth; they take that of the nearest that has")
+        job.facts.append(
+            f"{100 * share:.1f} % of the pixels have no depth; they took that of the nearest pixel with depth"
+        )
 
 
 def fill_depth(depth: Float32Array) -> tuple[Float32Array, int]:

@@ -13,6 +13,7 @@ number. Between pixels the inverse of D_s is interpolated, which is exact on pla
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,34 +23,47 @@ from uni4d_fg.arrays import Float32Array, FloatArray
 _OUTSIDE = -1e4
 
 
+class Averaged(NamedTuple):
+    """Depth and how many agree on it."""
+
+    depth: Float32Array
+    """(H, W) m, NaN exactly where the frame's own is."""
+    agreeing: Float32Array
+    """(H, W) number of other frames that agree."""
+    seeing: Float32Array
+    """(H, W) number of other frames that have depth where the pixel falls in them."""
+
+
 def average_over_frames(
     depth: Float32Array,
     world_T_cam: FloatArray,
-    others: Iterable[tuple[Float32Array, FloatArray]],
+    others: Iterable[tuple[Float32Array, FloatArray, FloatArray]],
     intrinsics: FloatArray,
     max_disagreement: float,
-) -> Float32Array:
+) -> Averaged:
     """Average one frame's depth with that of other frames.
 
     Args:
         depth: (H, W) m, NaN where missing or moving.
         world_T_cam: (4, 4) pose of the frame.
-        others: Depth (H, W), NaN where missing or moving, and pose (4, 4) of each other frame.
-        intrinsics: (4,) px.
+        others: Depth (H, W), NaN where missing or moving, pose (4, 4) and intrinsics (4,) px of each
+            other frame.
+        intrinsics: (4,) px, of the frame.
         max_disagreement: Largest ``|log(D_s / z')|`` at which a frame agrees.
 
-    Returns:
-        (H, W) float32 m, NaN exactly where ``depth`` is.
     """
     height, width = depth.shape
     fx, fy, cx, cy = (np.float32(value) for value in intrinsics)
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     points = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth]).reshape(3, -1)
     correction = np.zeros(height * width, np.float32)
-    count = np.ones(height * width, np.float32)
-    for other, pose in others:
+    count = np.zeros(height * width, np.float32)
+    seeing = np.zeros(height * width, np.float32)
+    for other, pose, camera in others:
+        fx, fy, cx, cy = (np.float32(value) for value in camera)
         other_T_cam = np.linalg.solve(pose, world_T_cam).astype(np.float32)
-        x, y, z = other_T_cam[:3, :3] @ points + other_T_cam[:3, 3:]
+        with np.errstate(invalid="ignore"):
+            x, y, z = other_T_cam[:3, :3] @ points + other_T_cam[:3, 3:]
         with np.errstate(invalid="ignore", divide="ignore"):
             inverse = np.where(z > 0, 1.0 / z, np.float32(np.nan))
             seen_u = np.nan_to_num(fx * x * inverse + cx, nan=_OUTSIDE, posinf=_OUTSIDE, neginf=_OUTSIDE)
@@ -66,5 +80,6 @@ def average_over_frames(
             agrees = np.abs(difference) < max_disagreement
         correction[agrees] += difference[agrees]
         count += agrees
-    result: Float32Array = depth * np.exp(correction / count).reshape(height, width)
-    return result
+        seeing += np.isfinite(difference)
+    result: Float32Array = depth * np.exp(correction / (count + 1)).reshape(height, width)
+    return Averaged(result, count.reshape(height, width), seeing.reshape(height, width))

@@ -48,7 +48,7 @@ def static_cloud(
         images: T images (H, W, 3), RGB.
         depths: T maps (H, W), meters, NaN where missing.
         masks: T label maps (H, W), 0 static.
-        intrinsics: (4,) fx, fy, cx, cy, px.
+        intrinsics: (4,) fx, fy, cx, cy, px, or (T, 4) of each frame.
         world_T_cam: (T, 4, 4) camera to world, meters.
         config: Strides, voxel size and edge threshold.
         band_px: Width of the band around instances, px.
@@ -60,10 +60,11 @@ def static_cloud(
     """
     parts: list[Cloud] = []
     waiting = 0
+    cameras = np.broadcast_to(intrinsics, (len(images), 4))
     for frame in range(0, len(images), config.static_frame_stride):
         image, depth, mask = _maps(frame, images, depths, masks)
         keep = ~dilate(mask > 0, band_px) & ~depth_edges(depth, config.edge_relative_gradient)
-        part = lift(image, depth, keep, intrinsics, world_T_cam[frame], config.static_stride, lens)
+        part = lift(image, depth, keep, cameras[frame], world_T_cam[frame], config.static_stride, lens)
         parts.append(part)
         waiting += len(part.points)
         if waiting > _POINTS_BETWEEN_MERGES and config.static_voxel_m > 0.0:
@@ -81,9 +82,10 @@ def dynamic_clouds(
     lens: Lens = PINHOLE,
 ) -> Iterator[Cloud]:
     """Yield the cloud of the moving instances of each frame in turn; arguments as in :func:`static_cloud`."""
+    cameras = np.broadcast_to(intrinsics, (len(images), 4))
     for frame in range(len(images)):
         image, depth, mask = _maps(frame, images, depths, masks)
-        yield dynamic_cloud(image, depth, mask, intrinsics, world_T_cam[frame], config, lens)
+        yield dynamic_cloud(image, depth, mask, cameras[frame], world_T_cam[frame], config, lens)
 
 
 def dynamic_cloud(

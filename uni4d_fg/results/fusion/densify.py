@@ -36,6 +36,8 @@ class ControlPoints:
     """(N,) log of the point's depth over the cue."""
     instance: Int32Array
     """(N,) 0 static, > 0 instance."""
+    points: FloatArray
+    """(N, 3) world, m."""
 
 
 def densify_frame(

@@ -7,8 +7,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize, TwoSlopeNorm
-from matplotlib.image import AxesImage
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LogNorm, Normalize, TwoSlopeNorm
+from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from uni4d_fg.arrays import Float32Array, ImageArray
@@ -18,6 +19,9 @@ from uni4d_fg.results.pictures.figure import INK, MUTED, new_figure, save_figure
 
 _MISSING = "#b9bdc3"
 _MAX_COLUMN_PX = 480
+_COLUMN_IN = 2.5
+_GAP_PX = 6
+_LEFT_IN, _RIGHT_IN, _TOP_IN, _BOTTOM_IN = 0.3, 0.9, 0.3, 0.1
 
 
 def draw_depth_strip(
@@ -49,36 +53,71 @@ def draw_depth_strip(
     shown_cue = [_positive(_thin(cue[t])) for t in frames]
     shown_fused = [_positive(_thin(fused[t])) for t in frames]
     change = [100.0 * (f / c - 1.0) for c, f in zip(shown_cue, shown_fused, strict=True)]
-    height, width = shown_images[0].shape[:2]
-    column_in = 2.5
-    figure = new_figure(column_in * len(frames) + 1.2, 4 * column_in * height / width + 0.5)
-    grid = np.asarray(figure.subplots(4, len(frames), squeeze=False))
     low, high = depth_bounds(shown_cue + shown_fused)
     depth_norm = LogNorm(low, high, clip=True)
     change_norm = _change_range(change)
     colors = matplotlib.colormaps["turbo_r"].with_extremes(bad=_MISSING)
     signed = matplotlib.colormaps["RdBu_r"].with_extremes(bad=_MISSING)
-
-    shown: list[AxesImage] = []
-    for column, frame in enumerate(frames):
-        grid[0, column].set_title(f"frame {frame}", fontsize=9, color=MUTED)
-        grid[0, column].imshow(shown_images[column])
-        grid[1, column].imshow(shown_cue[column], cmap=colors, norm=depth_norm, interpolation="nearest")
-        depth = grid[2, column].imshow(shown_fused[column], cmap=colors, norm=depth_norm, interpolation="nearest")
-        ratio = grid[3, column].imshow(change[column], cmap=signed, norm=change_norm, interpolation="nearest")
-        shown = [depth, ratio]
-    for row, name in enumerate(("image", "depth cue", "fused depth", "change")):
-        for panel in grid[row]:
-            _bare(panel)
-        grid[row, 0].set_ylabel(name, fontsize=10, color=INK)
-    bar = figure.colorbar(shown[0], ax=list(grid[1:3].ravel()), pad=0.01, aspect=30)
-    _label_depths(bar.ax, depth_norm)
-    bar.set_label(f"depth [{unit}]", fontsize=9, color=INK)
-    bar_change = figure.colorbar(shown[1], ax=list(grid[3]), pad=0.01, aspect=15)
-    bar_change.set_label("fused / cue [%]", fontsize=9, color=INK)
-    for axis in (bar.ax, bar_change.ax):
-        axis.tick_params(labelsize=8, colors=MUTED)
+    rows = [
+        shown_images,
+        [_painted(depth, depth_norm, colors) for depth in shown_cue],
+        [_painted(depth, depth_norm, colors) for depth in shown_fused],
+        [_painted(ratio, change_norm, signed) for ratio in change],
+    ]
+    # One picture on one pair of axes: laying out twenty of them takes longer than everything else here.
+    figure = _mosaic(rows, [f"frame {frame}" for frame in frames], ("image", "depth cue", "fused depth", "change"))
+    bar = _color_bar(figure, (1, 3), ScalarMappable(depth_norm, colors), f"depth [{unit}]")
+    _label_depths(bar, depth_norm)
+    _color_bar(figure, (3, 4), ScalarMappable(change_norm, signed), "fused / cue [%]")
     save_figure(path, figure)
+
+
+def _painted(values: np.ndarray, norm: Normalize, colors: Colormap) -> ImageArray:
+    return np.asarray(colors(norm(np.ma.masked_invalid(values)), bytes=True))[..., :3]
+
+
+def _mosaic(rows: list[list[ImageArray]], titles: list[str], names: tuple[str, ...]) -> Figure:
+    """Return a figure with pictures of one size in rows, titles above the columns and names before the rows."""
+    height, width = rows[0][0].shape[:2]
+    step_x, step_y = width + _GAP_PX, height + _GAP_PX
+    mosaic = np.full((len(rows) * step_y - _GAP_PX, len(titles) * step_x - _GAP_PX, 3), 255, dtype=np.uint8)
+    for row, pictures in enumerate(rows):
+        for column, image in enumerate(pictures):
+            mosaic[row * step_y : row * step_y + height, column * step_x : column * step_x + width] = image
+    inches = _COLUMN_IN / width
+    shape = (mosaic.shape[1] * inches, mosaic.shape[0] * inches)
+    figure = new_figure(shape[0] + _LEFT_IN + _RIGHT_IN, shape[1] + _TOP_IN + _BOTTOM_IN, layout=None)
+    panel = figure.add_axes(_placed(figure, _LEFT_IN, _BOTTOM_IN, *shape))
+    panel.imshow(mosaic, interpolation="antialiased")
+    panel.set_axis_off()
+    for column, title in enumerate(titles):
+        panel.text(column * step_x + width / 2, -0.03 * height, title, fontsize=9, color=MUTED, ha="center")
+    for row, name in enumerate(names):
+        panel.text(
+            -0.02 * width, row * step_y + height / 2, name, fontsize=10, color=INK, ha="right", va="center", rotation=90
+        )
+    return figure
+
+
+def _color_bar(figure: Figure, rows: tuple[int, int], colors: ScalarMappable, label: str) -> Axes:
+    """Add a color bar to the right of the rows from the first to before the last of four."""
+    panel = figure.axes[0].get_position()
+    row = panel.height / 4
+    bottom, height = panel.y1 - rows[1] * row, (rows[1] - rows[0]) * row
+    width = figure.get_figwidth()
+    axes = figure.add_axes((panel.x1 + 0.1 / width, bottom + 0.05 * row, 0.12 / width, height - 0.1 * row))
+    bar = figure.colorbar(colors, cax=axes)
+    bar.set_label(label, fontsize=9, color=INK)
+    axes.tick_params(labelsize=8, colors=MUTED)
+    return axes
+
+
+def _placed(
+    figure: Figure, left: float, bottom: float, width: float, height: float
+) -> tuple[float, float, float, float]:
+    """Return a place given in inches as parts of the figure."""
+    across, up = figure.get_figwidth(), figure.get_figheight()
+    return left / across, bottom / up, width / across, height / up
 
 
 def _thin(array: np.ndarray) -> np.ndarray:
@@ -103,17 +142,14 @@ def _label_depths(axis: Axes, norm: LogNorm) -> None:
     """Put round numbers on a logarithmic color bar."""
     low, high = float(norm.vmin or 1.0), float(norm.vmax or 2.0)
     inside: list[float] = []
-    for mantissas in ((1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), tuple(np.arange(1.0, 10.0, 0.25))):
+    for mantissas in (
+        (1.0, 2.0, 5.0),
+        (1.0, 1.5, 2.0, 3.0, 5.0, 7.0),
+        (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0),
+    ):
         inside = [m * 10.0**e for e in range(-3, 4) for m in mantissas if low <= m * 10.0**e <= high]
         if len(inside) >= 4:
             break
     axis.yaxis.set_major_locator(FixedLocator(inside if len(inside) > 1 else [low, high]))
     axis.yaxis.set_minor_locator(NullLocator())
     axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
-
-
-def _bare(panel: Axes) -> None:
-    panel.set_xticks([])
-    panel.set_yticks([])
-    for spine in panel.spines.values():
-        spine.set_visible(False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,10 +17,13 @@ INK = "#22262b"
 MUTED = "#8a9099"
 GRID = "#e6e8eb"
 
+_COMPRESS_LEVEL = 3
+"""Of zlib: a third of the time of the default, a twentieth more bytes."""
 
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty white figure, size in inches, that draws without a display."""
-    figure = Figure(figsize=(width_in, height_in), dpi=120, facecolor="white", layout="constrained")
+
+def new_figure(width_in: float, height_in: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
+    """Return an empty white figure, size in inches, that draws without a display; no layout for axes placed by hand."""
+    figure = Figure(figsize=(width_in, height_in), dpi=120, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
@@ -31,7 +35,7 @@ def save_figure(path: Path, figure: Figure) -> None:
         OutputError: If the file cannot be written.
     """
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": _COMPRESS_LEVEL})
 
 
 def spread_frames(num_frames: int, count: int) -> list[int]:

@@ -181,7 +181,7 @@ def _draw_cameras(panel: Axes, view: View, reconstruction: Reconstruction, frame
     panel.plot(path[:, 0], path[:, 1], color=MUTED, linewidth=1.0, zorder=3)
     panel.plot(path[: frame + 1, 0], path[: frame + 1, 1], color=INK, linewidth=1.6, zorder=3)
     height, width = reconstruction.image_size
-    fx, fy, cx, cy = reconstruction.intrinsics
+    fx, fy, cx, cy = reconstruction.frame_intrinsics[frame]
     target = view.world_T_cam[:3, 3]
     reach = 0.07 * float(np.linalg.norm(reconstruction.world_T_cam[frame, :3, 3] - target))
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)

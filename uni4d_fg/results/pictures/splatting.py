@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.geometry.camera import project, world_to_camera
 
 _MAX_RADIUS_PX = 6
+_RADII_PX = np.array([0.0, 1.0, 1.42, 2.0, 2.24, 3.0, 4.0, 5.0, 6.0])
+"""Radii that discs are rounded down to: from each to the next, other pixels are inside."""
 _NEAR_M = 1e-3
-_EDGE_STRENGTH = 2.2
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,14 @@ def look_at(eye: FloatArray, target: FloatArray, up: FloatArray) -> FloatArray:
 
 
 def render(
-    view: View, points: FloatArray, colors: ImageArray, point_size_m: FloatArray, background: tuple[int, int, int]
+    view: View,
+    points: FloatArray,
+    colors: ImageArray,
+    point_size_m: FloatArray,
+    background: tuple[int, int, int],
+    *,
+    smallest_px: float = 1.0,
+    edge_strength: float = 2.2,
 ) -> tuple[ImageArray, FloatArray]:
     """Render a cloud, drawn at twice the resolution and averaged down.
 
@@ -62,13 +71,15 @@ def render(
         colors: (N, 3) RGB.
         point_size_m: (N,) diameter of each point, meters.
         background: RGB where there is no point.
+        smallest_px: Least radius of a disc, in half pixels.
+        edge_strength: How much what lies behind an edge is darkened; 0 leaves colors as they are.
 
     Returns:
         Image (H, W, 3) and depth (H, W), meters, infinite where there is no point.
     """
     fine = view.scaled(2)
-    color, depth = _splat(fine, points, colors, point_size_m)
-    shade = _edge_shading(depth)
+    color, depth = _splat(fine, points, colors, point_size_m, smallest_px)
+    shade = _edge_shading(depth, edge_strength)
     image = np.where(np.isfinite(depth)[..., None], color * shade[..., None], np.array(background, dtype=np.float64))
     height, width = view.image_size
     image = image.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
@@ -76,36 +87,57 @@ def render(
 
 
 def _splat(
-    view: View, points: FloatArray, colors: ImageArray, point_size_m: FloatArray
+    view: View, points: FloatArray, colors: ImageArray, point_size_m: FloatArray, smallest_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return color (H, W, 3) and depth (H, W) of the nearest disc in each pixel."""
+    """Return color (H, W, 3) and depth (H, W) of the nearest disc in each pixel.
+
+    Of the points whose middle is in one pixel the nearest is kept; its disc is then spread by a minimum filter, for
+    all points of one radius at once. So the work grows with points and with pixels, not with their product.
+    """
     height, width = view.image_size
     uv, z = view.project(points)
     column, row = np.rint(np.nan_to_num(uv, nan=-1e6)).clip(-1e6, 1e6).astype(np.int64).T
     margin = _MAX_RADIUS_PX
     near = np.isfinite(z) & (column >= -margin) & (row >= -margin) & (column < width + margin) & (row < height + margin)
-    column, row, z = column[near], row[near], z[near]
-    colors, radius = colors[near], 0.5 * view.intrinsics[0] * point_size_m[near] / z
-    radius = np.clip(radius, 1.0, _MAX_RADIUS_PX)
-    # Depth in the high bits and the point's index in the low ones: the minimum is the nearest point.
-    key = (z.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(len(z), dtype=np.uint64)
-    empty = np.uint64(2**64 - 1)
-    buffer = np.full(height * width, empty)
-    reach = int(np.ceil(radius.max())) if len(radius) else 0
-    for dv in range(-reach, reach + 1):
-        for du in range(-reach, reach + 1):
-            u, v = column + du, row + dv
-            inside = (du * du + dv * dv <= radius**2) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-            np.minimum.at(buffer, v[inside] * width + u[inside], key[inside])
-    filled = buffer != empty
-    index = (buffer[filled] & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    color = np.zeros((height * width, 3))
-    depth = np.full(height * width, np.inf)
+    column, row, z, colors = column[near] + margin, row[near] + margin, z[near], colors[near]
+    radius = np.clip(0.5 * view.intrinsics[0] * point_size_m[near] / z, smallest_px, _MAX_RADIUS_PX)
+    # Depth in the high bits and the point's number in the low ones: the minimum is the nearest point. Read as
+    # floating-point numbers, such patterns keep their order, and OpenCV has a fast minimum of those.
+    bits = z.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+    key = (bits | np.arange(len(z), dtype=np.uint64)).view(np.float64)
+    padded = height + 2 * margin, width + 2 * margin
+    order = np.argsort(-z, kind="stable")
+    buffer = np.full(padded, np.inf)
+    # Of numbers that are put into one place the last one stays: the nearest.
+    buffer[row[order], column[order]] = key[order]
+    filled = np.isfinite(buffer)
+    steps = np.zeros(padded, np.int64)
+    numbers = (buffer[filled].view(np.uint64) & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    steps[filled] = np.searchsorted(_RADII_PX, radius[numbers], side="right") - 1
+    nearest = buffer.copy()
+    for step, reach in enumerate(_RADII_PX):
+        here = filled & (steps == step)
+        if reach < 1.0 or not here.any():
+            continue
+        spread = cv2.erode(np.where(here, buffer, np.inf), _disc(reach), borderType=cv2.BORDER_REPLICATE)
+        nearest = np.minimum(nearest, spread)
+    nearest = nearest[margin:-margin, margin:-margin]
+    filled = np.isfinite(nearest)
+    index = (nearest[filled].view(np.uint64) & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    color, depth = np.zeros((height, width, 3)), np.full((height, width), np.inf)
     color[filled], depth[filled] = colors[index], z[index]
-    return color.reshape(height, width, 3), depth.reshape(height, width)
+    return color, depth
 
 
-def _edge_shading(depth: FloatArray) -> FloatArray:
+def _disc(radius: float) -> ImageArray:
+    """Return a filter of the pixels within a radius, px."""
+    reach = int(radius)
+    offset = np.arange(-reach, reach + 1)
+    inside = offset[:, None] ** 2 + offset[None, :] ** 2 <= radius**2
+    return np.asarray(inside, dtype=np.uint8)
+
+
+def _edge_shading(depth: FloatArray, strength: float) -> FloatArray:
     """Darken pixels that lie behind their neighbors (eye-dome lighting): factors (H, W) in (0, 1]."""
     log_depth = np.where(np.isfinite(depth), np.log(np.where(np.isfinite(depth), depth, 1.0)), np.nan)
     total = np.zeros(depth.shape)
@@ -114,4 +146,4 @@ def _edge_shading(depth: FloatArray) -> FloatArray:
             for step in (shift, -shift):
                 behind = log_depth - np.roll(log_depth, step, axis=axis)
                 total += np.clip(np.nan_to_num(behind, nan=0.0), 0.0, 0.2)
-    return np.exp(-_EDGE_STRENGTH * total)
+    return np.exp(-strength * total)

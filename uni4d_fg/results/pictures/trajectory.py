@@ -84,6 +84,8 @@ def _style(panel: Axes, name: str, label_x: str, label_y: str) -> None:
     panel.set_xlabel(label_x, color=INK, fontsize=9)
     panel.set_ylabel(label_y, color=INK, fontsize=9)
     panel.tick_params(labelsize=8, colors=MUTED)
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=6))
     panel.grid(True, color=GRID, linewidth=0.8)
     panel.set_axisbelow(True)
     for spine in panel.spines.values():

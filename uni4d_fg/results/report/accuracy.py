@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.results.evaluate.consistency import ConsistencyMetrics
 from uni4d_fg.results.evaluate.depth import DepthReport
 from uni4d_fg.results.evaluate.points import PointMetrics
 from uni4d_fg.results.evaluate.rigid_objects import ObjectReport
@@ -15,6 +18,7 @@ from uni4d_fg.results.report.markup import Markup, element, number, section, tab
 from uni4d_fg.results.run import Run
 
 _TITLE = "Accuracy against ground truth"
+_TOO_CERTAIN = 2.0
 
 
 def evaluate(run: Run) -> EvaluationReport | str:
@@ -39,6 +43,7 @@ def accuracy(report: EvaluationReport | str) -> Markup:
         return section("accuracy", _TITLE, element("p", report))
     parts = [
         *_trajectory(report.trajectory),
+        *_consistency(report.consistency),
         *_depth("Depth, fused", report.depth),
         *_depth("Depth, cue", report.depth_cue),
         *_points("Landmarks", report.landmarks),
@@ -63,6 +68,23 @@ def _trajectory(metrics: TrajectoryMetrics | None) -> list[Markup]:
         ["poses", str(metrics.poses), ""],
     ]
     return [element("h3", "Camera trajectory"), table(metrics.protocol, ("measure", "value", "unit"), rows)]
+
+
+def _consistency(results: Iterable[ConsistencyMetrics] | None) -> list[Markup]:
+    """Compare the errors with what the covariances promised."""
+    rows = [
+        [m.protocol, number(m.mean, 3), number(m.median, 3), f"{100 * m.within_95:.0f} %", str(m.frames)]
+        for m in results or ()
+    ]
+    if not rows:
+        return []
+    head = ("gauge", "mean, 1 if covariances hold", "median, likewise", "frames within their 95 % region", "frames")
+    ratio = float(np.sqrt([m.median for m in results or ()][-1]))
+    verdict = (
+        f"Errors are typically {ratio:.2g} times as large as the covariances say"
+        + (": do not take the covariances at their word." if ratio > _TOO_CERTAIN else ".")
+    )  # fmt: skip
+    return [element("h3", "Errors against covariances"), element("p", verdict), table("Consistency", head, rows)]
 
 
 def _depth(title: str, report: DepthReport | None) -> list[Markup]:

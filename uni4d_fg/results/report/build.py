@@ -7,19 +7,25 @@ from pathlib import Path
 from uni4d_fg.files import atomic_write_text
 from uni4d_fg.results.report.accuracy import accuracy, evaluate
 from uni4d_fg.results.report.cameras import trajectory, uncertainty
+from uni4d_fg.results.report.certainty import certainty
 from uni4d_fg.results.report.depth import depth_strips
 from uni4d_fg.results.report.distrust import distrusted
 from uni4d_fg.results.report.energy import energies
 from uni4d_fg.results.report.markup import Markup, bullets, element, join
+from uni4d_fg.results.report.masks import mask_strip
 from uni4d_fg.results.report.observations import dropped, residual_maps
 from uni4d_fg.results.report.overview import overview
 from uni4d_fg.results.report.style import STYLE
+from uni4d_fg.results.report.views import scene_views
 from uni4d_fg.results.residuals import reprojection_residuals
 from uni4d_fg.results.run import Run
 
 _CONTENTS = {
+    "certainty": "Certainty",
     "run": "What was run",
+    "views": "3D views",
     "trajectory": "Trajectory",
+    "masks": "Masks",
     "depth": "Depth",
     "residuals": "Residuals",
     "dropped": "Left out",
@@ -72,8 +78,11 @@ def report_page(run: Run) -> str:
             "main",
             _distrust(distrusted(run, residuals), run.notes),
             element("nav", element("ul", *links), aria_label="Contents"),
+            certainty(run),
             overview(run),
+            scene_views(run),
             trajectory(run),
+            mask_strip(run),
             depth_strips(run),
             residual_maps(run, residuals),
             dropped(run),

@@ -5,19 +5,56 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.results.colors import depth_bounds
+from uni4d_fg.results.depth_agreement import depth_disagreement
 from uni4d_fg.results.pictures.figure import spread_frames, thumbnail
 from uni4d_fg.results.report.chart import Line, line_chart
 from uni4d_fg.results.report.images import depth_gradient, depth_picture
-from uni4d_fg.results.report.markup import Markup, color_bar, element, figure, picture, section
+from uni4d_fg.results.report.markup import Markup, bullets, color_bar, element, figure, picture, section
 from uni4d_fg.results.run import Run
 
 _COLUMNS = 5
 _WIDTH = 300
+_CHECKED = 6
+"""Frames, or pairs of them, from which the quality is told."""
+_APART = 0.1
+"""Of the video, between the frames of a pair."""
 
 
 def depth_strips(run: Run) -> Markup:
-    """Return the section with strips of depth, and the scale that every frame's cue was given."""
-    return section("depth", "Depth", *_strips(run), _scales(run))
+    """Return the section with the quality of depth, strips of it, and the scale that every frame's cue was given."""
+    return section("depth", "Depth", _quality(run), *_strips(run), _scales(run))
+
+
+def _quality(run: Run) -> Markup:
+    """Say what is known of the dense depth without any ground truth."""
+    facts = [_sentence(str(fact)) for fact in run.summary.get("stages", {}).get("fusion", {}).get("facts", [])]
+    depth, sequence, result = run.depth, run.sequence, run.reconstruction
+    if depth is not None:
+        shares = [float(np.mean(np.asarray(depth[frame]) > 0)) for frame in spread_frames(run.num_frames, _CHECKED)]
+        facts.append(f"Fused depth is known for {100 * np.mean(shares):.1f} % of the pixels.")
+    apart = max(1, round(run.num_frames * _APART))
+    pairs = [(frame, frame + apart) for frame in spread_frames(run.num_frames - apart, _CHECKED)]
+    masks = None if sequence is None else sequence.masks
+    differences: dict[str, np.ndarray] = {}
+    if pairs and depth is not None:
+        differences["fused"] = depth_disagreement(depth, result, masks, pairs)
+    if pairs and sequence is not None and sequence.depths is not None:
+        differences["cue"] = depth_disagreement(sequence.depths, result, masks, pairs, result.depth_log_scale)
+    said = [
+        f"{name} depth by {100 * np.median(values):.2g} % (a tenth of the pixels by more than "
+        f"{100 * np.quantile(values, 0.9):.2g} %)"
+        for name, values in differences.items() if values.size
+    ]  # fmt: skip
+    if said:
+        facts.append(
+            f"Carried by the cameras between frames that are {apart} apart, static pixels differ in the median: "
+            f"{'; '.join(said)}. What is hidden in one of both frames differs as well."
+        )
+    return bullets(facts) if facts else Markup("")
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
 
 
 def _strips(run: Run) -> list[Markup]:
@@ -60,6 +97,10 @@ def _scales(run: Run) -> Markup:
     chart = line_chart(
         "depth-scale", "Factor that the depth cue of each frame is multiplied by",
         [Line("factor", list(range(run.num_frames)), (100.0 * (scales - 1.0)).tolist())],
-        x_label="frame", y_label="cue too small by [%]",
+        x_label="frame", y_label="scale correction [%]",
     )  # fmt: skip
-    return element("div", figure(chart, "By how much the cue of each frame is too small"), class_="charts")
+    return element(
+        "div",
+        figure(chart, "How much the depth of each frame was scaled: above zero, the cue was too small"),
+        class_="charts",
+    )

@@ -12,6 +12,8 @@ import numpy as np
 from uni4d_fg.arrays import ImageArray
 
 _VOID = frozenset({"img", "br", "meta", "hr"})
+_LONG_TABLE = 9
+"""Rows; a longer table is folded."""
 
 
 class Markup(str):
@@ -52,13 +54,31 @@ def bullets(items: Iterable[str], **attributes: str) -> Markup:
 
 
 def table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
-    """Return a table that scrolls sideways on a narrow screen; the first cell of a row is its heading."""
+    """Return a table that scrolls sideways on a narrow screen; the first cell of a row is its heading.
+
+    A long one is folded behind its caption.
+    """
     head = element("tr", *(element("th", cell, scope="col") for cell in header))
     body = [
         element("tr", element("th", row[0], scope="row"), *(element("td", cell) for cell in row[1:])) for row in rows
     ]
     content = element("table", element("caption", caption), element("thead", head), element("tbody", *body))
-    return element("div", content, class_="scroll", tabindex=0, role="region", aria_label=caption)
+    scrolled = element("div", content, class_="scroll", tabindex=0, role="region", aria_label=caption)
+    return fold(f"{caption} ({len(body)} rows)", scrolled) if len(body) > _LONG_TABLE else scrolled
+
+
+def fold(summary: str, *content: str) -> Markup:
+    """Return content behind a line that opens it."""
+    return element("details", element("summary", summary), *content)
+
+
+def swatches(entries: Iterable[tuple[str, Sequence[int]]]) -> Markup:
+    """Return a legend: texts, each beside its color (RGB)."""
+    items = []
+    for text, color in entries:
+        style = "background:#{:02x}{:02x}{:02x}".format(*color)
+        items.append(element("li", element("span", class_="swatch", style=style, aria_hidden="true"), text))
+    return element("ul", *items, class_="legend")
 
 
 def figure(content: str, caption: str) -> Markup:

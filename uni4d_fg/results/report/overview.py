@@ -11,6 +11,7 @@ from uni4d_fg.config.load import load_config, preset_names, read_yaml
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.results.report.markup import Markup, bullets, element, join, number, section, table
 from uni4d_fg.results.run import Run
+from uni4d_fg.slam.reconstruction import Reconstruction
 
 
 def overview(run: Run) -> Markup:
@@ -29,18 +30,18 @@ def _facts(run: Run) -> Markup:
     seconds = [_seconds(stage) for stage in summary.get("stages", {}).values()]
     memory = [stage.get("peak_memory_mb", 0.0) for stage in summary.get("stages", {}).values()]
     solver = summary.get("solver", {})
-    fx, fy, cx, cy = reconstruction.intrinsics.tolist()
+    cx, cy = reconstruction.intrinsics[2:].tolist()
     facts = {
         "Sequence": str(summary.get("sequence", {}).get("root") or run.name),
         "Frames": f"{run.num_frames}, {width} × {height} px",
         "Times": "not known"
         if np.array_equal(times, np.arange(len(times)))
         else f"{times[0]:.6g} to {times[-1]:.6g} s",
-        "Time taken": f"{sum(seconds):.1f} s" if seconds else "not recorded",
+        "Time taken": _time_taken(sum(seconds), summary.get("cues")) if seconds else "not recorded",
         "Peak memory": f"{max(memory):.0f} MB" if any(memory) else "not recorded",
         "Solver": ", backend ".join(str(solver[key]) for key in ("solver", "backend") if key in solver)
         or "not recorded",
-        "Focal length": f"fx {fx:.1f}, fy {fy:.1f} px",
+        "Focal length": _focal_length(reconstruction),
         "Principal point": f"cx {cx:.1f}, cy {cy:.1f} px",
         "Static landmarks": str(len(reconstruction.landmarks)),
         "Moving trajectories": str(len(reconstruction.dynamic_points)),
@@ -50,6 +51,21 @@ def _facts(run: Run) -> Markup:
         "dl", *(element("div", element("dt", name), element("dd", value)) for name, value in facts.items()),
         class_="facts",
     )  # fmt: skip
+
+
+def _time_taken(stages: float, cues: Any) -> str:
+    """Return the whole time: that of the cues is the larger part where a video brings none."""
+    making = cues.get("seconds", 0.0) if isinstance(cues, dict) else 0.0
+    if not isinstance(making, int | float) or not making > 0:
+        return f"{stages:.1f} s"
+    return f"{stages + making:.1f} s, {making:.1f} s of it for cues"
+
+
+def _focal_length(reconstruction: Reconstruction) -> str:
+    fx, fy = reconstruction.frame_intrinsics[:, :2].T
+    if reconstruction.zoom is None:
+        return f"fx {fx[0]:.1f}, fy {fy[0]:.1f} px"
+    return f"zoom: fx {fx.min():.1f} to {fx.max():.1f}, fy {fy.min():.1f} to {fy.max():.1f} px"
 
 
 def _cues(summary: dict[str, Any]) -> Markup:

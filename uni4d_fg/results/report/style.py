@@ -44,6 +44,8 @@ svg .grid{stroke:var(--line);stroke-width:1}
 svg .line{fill:none;stroke-width:2;stroke-linejoin:round;stroke-linecap:round}
 .legend{display:flex;flex-wrap:wrap;gap:.1rem 1rem;font-size:.88rem;margin:.2rem 0;padding:0;list-style:none}
 .legend svg{width:1.8rem;height:.7rem;display:inline-block;vertical-align:middle;margin-right:.4rem}
+.swatch{display:inline-block;width:.9rem;height:.9rem;border-radius:.2rem;vertical-align:-.1rem;margin-right:.4rem;
+print-color-adjust:exact;-webkit-print-color-adjust:exact}
 img{max-width:100%;height:auto;display:block;border-radius:.2rem}
 .strip{display:grid;grid-template-columns:repeat(var(--columns),minmax(6.5rem,1fr));gap:.25rem;overflow-x:auto;padding-bottom:.3rem}
 .strip figure{margin:0}

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from uni4d_fg.results.view.coloring import ColorBy
-from uni4d_fg.results.view.layers import Shown
+from uni4d_fg.results.view.shown import Shown
 
 _MAX_HISTORY = 8
 
@@ -33,6 +34,7 @@ class Panel:
             self.static = gui.add_checkbox("Static cloud", initial_value=start.static)
             self.landmarks = gui.add_checkbox("Landmarks", initial_value=start.landmarks)
             self.moving = gui.add_checkbox("Moving cloud", initial_value=start.moving)
+            self.full = gui.add_checkbox("Every pixel of this frame", initial_value=start.full)
             self.history = gui.add_slider("Earlier clouds", min=0, max=_MAX_HISTORY, step=1, initial_value=0)
             self.trajectories = gui.add_checkbox("Trajectories", initial_value=start.trajectories)
             self.trail = gui.add_slider(
@@ -50,6 +52,25 @@ class Panel:
             self.follow = gui.add_checkbox("Follow the camera", initial_value=False)
             self.overview = gui.add_button("Whole scene")
         self.notes = gui.add_html("")
+        self._gui = gui
+
+    @property
+    def of_the_picture(self) -> tuple[Any, ...]:
+        """Controls that change what is shown."""
+        return (
+            self.frame, self.color, self.point_size, self.static, self.landmarks, self.moving, self.full, self.history,
+            self.trajectories, self.trail, self.objects, self.cameras, self.images,
+        )  # fmt: skip
+
+    def add_keys(self, step: Callable[[int], None]) -> None:
+        """Let the space bar start and halt the time, and the arrow keys go by a frame."""
+        for label, key, frames in (
+            ("Play or halt", "space", 0),
+            ("Next frame", "arrowright", 1),
+            ("Frame before", "arrowleft", -1),
+        ):
+            command = self._gui.add_command(label, hotkey=key)
+            command.on_trigger(lambda _, frames=frames: step(frames))
 
     @property
     def color_by(self) -> ColorBy:
@@ -63,6 +84,7 @@ class Panel:
             static=self.static.value,
             landmarks=self.landmarks.value,
             moving=self.moving.value,
+            full=self.full.value,
             trajectories=self.trajectories.value,
             objects=self.objects.value,
             cameras=self.cameras.value,

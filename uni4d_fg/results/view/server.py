@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import http
+import inspect
 import io
 import ipaddress
 import socket
-from collections.abc import Iterator
+from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
 from uni4d_fg.errors import ConfigError, MissingDependencyError
 from uni4d_fg.optional import import_viser
+from uni4d_fg.results.view.page import answer_with_scripts
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
@@ -66,7 +68,7 @@ def _is_loopback(name: str) -> bool:
 
 @contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Let servers that start within the block refuse requests of pages of other origins.
+    """Let servers that start within the block refuse requests of other origins, and send the page with our scripts.
 
     viser has no option for that, but passes what answers requests on to ``websockets``; here a check goes before it.
 
@@ -85,7 +87,13 @@ def _own_pages_only(host: str) -> Iterator[None]:
             asked, origin = (found[0] if found else None for found in (hosts, origins))
             if len(hosts) > 1 or len(origins) > 1 or not is_own_page(host, asked, origin):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "This page may not use the viewer.\n")
-            return None if process_request is None else process_request(connection, request)
+            answer = None if process_request is None else process_request(connection, request)
+            if inspect.isawaitable(answer):
+                return _later(answer)
+            return answer_with_scripts(answer)
+
+        async def _later(answer: Awaitable[Any]) -> Any:
+            return answer_with_scripts(await answer)
 
         return serve(*args, process_request=check, **options)
 
@@ -95,7 +103,7 @@ def _own_pages_only(host: str) -> Iterator[None]:
     finally:
         setattr(websockets_server, "serve", serve)  # noqa: B010
     if not guarded:
-        raise MissingDependencyError("this version of viser cannot be guarded: run `pip install 'viser>=1.0,<2'`")
+        raise MissingDependencyError("this version of viser cannot be guarded: run `pip install 'viser>=1.1,<2'`")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Trajectories as trails: line segments from where each point was a few frames ago to where it is."""
+"""Trajectories as trails: the step of every point from one frame to the next."""
 
 from __future__ import annotations
 
@@ -6,29 +6,20 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
 
-_FADED = 0.25
-"""Brightness of the oldest end of a trail."""
 
-
-def trail_segments(points: FloatArray, colors: ImageArray, frame: int, length: int) -> tuple[Float32Array, ImageArray]:
-    """Cut the last ``length`` steps up to a frame into line segments that fade towards the past.
+def step_segments(points: FloatArray, colors: ImageArray, frame: int) -> tuple[Float32Array, ImageArray]:
+    """Return the steps from the frame before to this one; a trail is the steps of several frames together.
 
     Args:
         points: (M, T, 3) world positions, NaN where unknown.
         colors: (M, 3) RGB per trajectory.
-        frame: The frame in which the trails end.
-        length: Steps of a trail; 0 gives none.
+        frame: The frame in which the steps end; frame 0 has none.
 
     Returns:
         (S, 2, 3) ends of the segments, and (S, 2, 3) RGB; a step of which either end is unknown has no segment.
     """
-    first = max(0, frame - length)
-    span = points[:, first : frame + 1]
-    if span.shape[1] < 2:
+    if frame < 1:
         return np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
-    ends = np.stack((span[:, :-1], span[:, 1:]), axis=2)
-    brightness = np.linspace(_FADED, 1.0, length + 1)[-span.shape[1] :]
-    shade = np.stack((brightness[:-1], brightness[1:]), axis=1)
-    shaded = np.rint(colors[:, None, None, :] * shade[None, :, :, None]).astype(np.uint8)
-    known = np.isfinite(ends).all(axis=(2, 3))
-    return ends[known].astype(np.float32), shaded[known]
+    ends = points[:, frame - 1 : frame + 1]
+    known = np.isfinite(ends).all(axis=(1, 2))
+    return ends[known].astype(np.float32), np.repeat(colors[known][:, None], 2, axis=1)

@@ -5,130 +5,162 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from uni4d_fg.arrays import evenly_spread
 from uni4d_fg.results.measures import scene_depth
-from uni4d_fg.results.pictures.figure import upright_axes
 from uni4d_fg.results.run import Run
+from uni4d_fg.results.view.camera_layer import CameraLayer, ObjectLayer
 from uni4d_fg.results.view.coloring import ColorBy, Coloring, as_html, values_of
 from uni4d_fg.results.view.content import Limits, RunClouds
-from uni4d_fg.results.view.layers import (
-    CameraLayer,
-    ObjectLayer,
-    PointLayers,
-    Shown,
-    TrajectoryLayer,
-    quaternion,
-    vertical_fov,
-)
+from uni4d_fg.results.view.frame_layer import FrameLayer
+from uni4d_fg.results.view.framing import FOV_RAD, Framing, first_view
+from uni4d_fg.results.view.nodes import quaternion, vertical_fov
 from uni4d_fg.results.view.panel import Panel
+from uni4d_fg.results.view.shown import Shown
+from uni4d_fg.results.view.static_layer import StaticLayer
 
-_POINT_SIZE = 0.004
-"""Size of a point, in parts of the scene's depth."""
-_CAMERA_SIZE = 0.09
-_IDLE_SECONDS = 0.05
+CAMERA_SIZE = 0.035
+"""Size of the current camera, in parts of the scene's depth."""
+_IDLE_SECONDS = 0.03
+_STILL_SECONDS = 0.3
+"""The time must stand still for so long before every pixel of a frame is sent."""
 
 
 class Viewer:
-    """Draws a run into a viser server; thread-safe, as callbacks come from viser's threads."""
+    """Draws a run into a viser server; thread-safe, as callbacks come from viser's threads.
+
+    It begins with a thin cloud and the first frame; :meth:`load` sends the rest.
+    """
 
     def __init__(self, server: Any, run: Run, limits: Limits | None = None) -> None:
         limits = limits or Limits()
         self._server, self._run, self._lock = server, run, threading.RLock()
-        clouds = RunClouds(run, limits)
-        static, source = clouds.static()
         reconstruction = run.reconstruction
         self._depth = scene_depth(reconstruction)
+        self._clouds = RunClouds(run, limits)
+        self._static_cloud, self._source = self._clouds.static()
         self._values = values_of(run)
-        self._shown = Shown(landmarks=source == "none")
+        self._shown = Shown(landmarks=self._source == "none")
         self._coloring = Coloring(ColorBy.image, run, self._values)
-        size = _POINT_SIZE * self._depth
+        size = CAMERA_SIZE * self._depth
         rows = evenly_spread(len(reconstruction.landmarks), limits.landmarks)
-        self._points = PointLayers(server, run, clouds, static, rows, size)
+        self._static = StaticLayer(server, run, self._depth, rows)
         tracks = evenly_spread(len(reconstruction.dynamic_points), limits.trajectories)
-        self._trajectories = TrajectoryLayer(server, run, tracks, size)
-        self._cameras = CameraLayer(server, run, limits, _CAMERA_SIZE * self._depth)
-        self._objects = ObjectLayer(server, run, _CAMERA_SIZE * self._depth)
+        self._frames = FrameLayer(server, run, self._clouds, tracks, self._depth)
+        self._cameras = CameraLayer(server, run, limits, size)
+        self._objects = ObjectLayer(server, run, 2.0 * size)
         times = np.diff(reconstruction.timestamps)
         rate = 1.0 / float(np.median(times)) if len(times) else 1.0
         # Sequences without times count frames; they play at an ordinary rate.
         self.panel = Panel(server, run.num_frames, run.name, rate if rate > 1.5 else 15.0, self._shown)
         self.panel.objects.visible = self._objects.count > 0
-        self.panel.notes.content = _notes(run, source, limits)
+        self.panel.notes.content = _notes(run, self._source, limits)
+        self._changed = time.monotonic()
         self._prepare_scene()
         self._attach()
 
     def _prepare_scene(self) -> None:
-        axes = upright_axes(self._run.reconstruction.world_T_cam)
-        self._server.scene.set_up_direction(axes[2])
-        self._overview = self._overview_of(axes)
+        view = first_view(self._run.reconstruction, self._depth)
+        self._server.scene.set_up_direction(view.up)
         camera = self._server.initial_camera
-        camera.position, camera.look_at = self._overview
-        camera.up = axes[2]
+        camera.position, camera.look_at, camera.up, camera.fov = view.position, view.look_at, view.up, FOV_RAD
         camera.near, camera.far = 1e-3 * self._depth, 1e3 * self._depth
         with self._server.atomic():
-            self._cameras.build(self._coloring)
-            self._draw_still()
-            self._draw_frame()
-
-    def _overview_of(self, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a position behind, above and beside the first camera, and the point to look at."""
-        first = self._run.reconstruction.world_T_cam[:, :3, 3].mean(axis=0)
-        right, forward, up = axes
-        target = first + 0.8 * self._depth * forward
-        return first + self._depth * (0.3 * right - 0.5 * forward + 0.35 * up), target
+            self._static.build(self._coloring, self._shown)
+            self._static.show_first(self._static_cloud, self._coloring, self._shown.point_size)
+            self._frames.build(self._shown)
+            self._cameras.build(self._coloring, self._shown)
+            self._load_frame(0)
+            self._show()
+        self.panel.legend.content = self._coloring.legend()
 
     def _attach(self) -> None:
         panel = self.panel
-        for control in (
-            panel.static, panel.landmarks, panel.moving, panel.trajectories, panel.objects,
-            panel.cameras, panel.images, panel.history, panel.trail, panel.point_size, panel.color, panel.frame,
-        ):  # fmt: skip
+        for control in panel.of_the_picture:
             control.on_update(lambda _: self.refresh())
         panel.look_through.on_click(lambda event: self._look_through([event.client]))
         panel.overview.on_click(lambda event: self._show_overview(event.client))
         panel.follow.on_update(lambda _: self._follow_if_asked())
+        panel.add_keys(self.step)
+        self._server.on_client_connect(self._welcome)
+
+    def load(self, should_stop: Callable[[], bool] = lambda: False) -> None:
+        """Send everything that is not there yet: the whole static cloud, all frames, then the dense static cloud."""
+        if len(self._static_cloud.points) > self._static.num_points:
+            self._send_static(self._static_cloud)
+        for frame in range(self._run.num_frames):
+            if should_stop():
+                return
+            with self._lock:
+                self._load_frame(frame)
+        dense = self._clouds.dense_static(should_stop)
+        if dense is not None and len(dense.points) > len(self._static_cloud.points) and not should_stop():
+            self._static_cloud = dense
+            self._send_static(dense)
+
+    def _send_static(self, cloud: Any) -> None:
+        coloring, factor = self._coloring, self._shown.point_size
+        # Chunks of millions of points take seconds; the panel must answer meanwhile.
+        node = self._static.send(cloud, coloring, factor)
+        with self._lock, self._server.atomic():
+            self._static.replace_by(cloud, node)
+            if self._coloring is not coloring:
+                self._static.color(self._coloring)
+            if self._shown.point_size != factor:
+                self._static.resize(self._shown.point_size)
+
+    def _load_frame(self, frame: int) -> None:
+        self._frames.load(frame, self._coloring, self._shown.point_size)
+        self._cameras.load(frame, self._shown)
 
     def refresh(self) -> None:
-        """Draw what the panel asks for now."""
+        """Show what the panel asks for now."""
         with self._lock:
             shown, by = self.panel.shown(), self.panel.color_by
+            if by in (ColorBy.residual, ColorBy.uncertainty):
+                # Only landmarks have numbers of their own.
+                shown = replace(shown, landmarks=True)
             before, self._shown = self._shown, shown
             recolored = by is not self._coloring.by
             if shown == before and not recolored:
                 return
+            if shown.frame != before.frame or shown.full != before.full or recolored:
+                self._changed = time.monotonic()
+            if shown.images != before.images:
+                self._cameras.drop_images()
+            if shown.frame not in self._frames.loaded or shown.images != before.images:
+                self._load_frame(shown.frame)
             with self._server.atomic():
+                self._show()
                 if recolored:
-                    self._coloring = Coloring(by, self._run, self._values)
-                    self._cameras.color(self._coloring)
-                if recolored or _still(before) != _still(shown):
-                    self._draw_still()
-                self._draw_frame()
+                    self._recolor(by)
+                if shown.point_size != before.point_size:
+                    self._static.resize(shown.point_size)
+                    self._frames.resize(shown.point_size)
             if before.frame != shown.frame:
                 self._follow_if_asked()
 
-    def _draw_still(self) -> None:
-        shown = self._shown
-        if self._coloring.by in (ColorBy.residual, ColorBy.uncertainty):
-            # Only landmarks have numbers of their own.
-            shown = Shown(**{**vars(shown), "landmarks": True})
-        self._points.draw_still(self._coloring, shown)
+    def _recolor(self, by: ColorBy) -> None:
+        self._coloring = Coloring(by, self._run, self._values)
+        for layer in (self._cameras, self._static, self._frames):
+            layer.color(self._coloring)
         self.panel.legend.content = self._coloring.legend()
 
-    def _draw_frame(self) -> None:
-        self._points.draw_frame(self._coloring, self._shown)
-        self._trajectories.draw(self._coloring, self._shown)
+    def _show(self) -> None:
+        self._static.show(self._shown)
+        self._frames.show(self._shown)
         self._objects.draw(self._shown)
-        self._cameras.draw_frame(self._shown)
+        self._cameras.show(self._shown)
         self.panel.facts.content = self._facts(self._shown.frame)
 
     def _facts(self, frame: int) -> str:
         reconstruction, values = self._run.reconstruction, self._values
         parts = [f"frame {frame} of {self._run.num_frames}"]
-        if not np.array_equal(reconstruction.timestamps, np.arange(self._run.num_frames)):
+        if self._run.has_times:
             parts[0] += f", {reconstruction.timestamps[frame]:.3f} s"
         if np.isfinite(values.camera_error[frame]):
             parts.append(f"median residual {values.camera_error[frame]:.2f} px")
@@ -137,11 +169,22 @@ class Viewer:
             parts.append(f"position ± {factor * values.position_sigma[frame]:.2g} {unit}")
         return as_html(parts)
 
+    def step(self, frames: int) -> None:
+        """Go some frames forward or back, around the ends; 0 starts or halts the time."""
+        with self._lock:
+            if frames == 0:
+                self.panel.play.value = not self.panel.play.value
+                return
+            # Slider and picture in one message, so that no picture is of another frame than the slider says.
+            with self._server.atomic():
+                self.panel.frame.value = (int(self.panel.frame.value) + frames) % self._run.num_frames
+                self.refresh()
+
     def _look_through(self, clients: list[Any]) -> None:
         reconstruction = self._run.reconstruction
         pose = reconstruction.world_T_cam[self._shown.frame]
         height, width = reconstruction.image_size
-        fov = vertical_fov(reconstruction)
+        fov = vertical_fov(reconstruction, self._shown.frame)
         # The frusta would stand in the way of the view that is asked for.
         self.panel.cameras.value = False
         for client in clients:
@@ -157,34 +200,43 @@ class Viewer:
         if self.panel.follow.value:
             self._look_through(list(self._server.get_clients().values()))
 
+    def _welcome(self, client: Any) -> None:
+        if 0.0 < client.camera.aspect < 1.0:
+            _point(client, first_view(self._run.reconstruction, self._depth, client.camera.aspect))
+
     def _show_overview(self, client: Any) -> None:
         self.panel.follow.value = False
         self.panel.cameras.value = True
-        position, target = self._overview
-        with client.atomic():
-            client.camera.up_direction = upright_axes(self._run.reconstruction.world_T_cam)[2]
-            client.camera.position = position
-            client.camera.look_at = target
-            client.camera.fov = np.radians(60.0)
+        _point(client, first_view(self._run.reconstruction, self._depth, client.camera.aspect or 1.5))
 
     def run_until(self, should_stop: Callable[[], bool]) -> None:
-        """Play when asked to, until ``should_stop``."""
+        """Play when asked to, and fill in a frame that stands still, until ``should_stop``."""
         due = time.monotonic()
         while not should_stop():
             if not self.panel.play.value or self._run.num_frames < 2:
+                self._fill_in_if_still()
                 time.sleep(_IDLE_SECONDS)
                 due = time.monotonic()
                 continue
             due += 1.0 / float(self.panel.frames_per_second.value)
-            self.panel.frame.value = (int(self.panel.frame.value) + 1) % self._run.num_frames
-            self.refresh()
+            self.step(1)
             # Drawing may take longer than a frame lasts; the rate then drops instead of a queue growing.
             due = max(due, time.monotonic())
             time.sleep(min(max(due - time.monotonic(), 0.001), 1.0))
 
+    def _fill_in_if_still(self) -> None:
+        if self._changed and time.monotonic() - self._changed > _STILL_SECONDS and self._shown.full:
+            with self._lock:
+                self._changed = 0.0
+                self._frames.show_full(self._shown, self._coloring)
 
-def _still(shown: Shown) -> tuple[bool, bool, float]:
-    return shown.static, shown.landmarks, shown.point_size
+
+def _point(client: Any, view: Framing) -> None:
+    with client.atomic():
+        client.camera.up_direction = view.up
+        client.camera.position = view.position
+        client.camera.look_at = view.look_at
+        client.camera.fov = FOV_RAD
 
 
 def _notes(run: Run, source: str, limits: Limits) -> str:

@@ -124,3 +124,36 @@ def larger_covariance(first: FloatArray, second: FloatArray) -> FloatArray:
     factor = root @ (axes * np.sqrt(np.maximum(values, 1.0)))
     result: FloatArray = factor @ factor.T
     return result
+
+
+def refocused(reference_T_cam: FloatArray, ratio: FloatArray, deeper: float) -> FloatArray:
+    """Return a small relative pose (4, 4) as it would have been found with other focal lengths and depths.
+
+    To first order in the motion, with points that the reference sees at known depths, pixels tell the step as a part of
+    the points' distance: f_x times that along x, f_y times that along y, and the one along z whatever the focal lengths
+    are. The turn is kept: how much of it follows depends on the field of view.
+
+    Args:
+        reference_T_cam: (4, 4).
+        ratio: (2,) of the focal lengths (x, y) that it was found with to the others.
+        deeper: Of the other depths to those that it was found with.
+    """
+    out = reference_T_cam.copy()
+    out[:3, 3] *= deeper * np.array([ratio[0], ratio[1], 1.0])
+    return out
+
+
+def shared_spread(reference_T_cam: FloatArray, focal_sigma: float, depth_sigma: float) -> FloatArray:
+    """Return the covariance (6, 6) that a small relative pose has of what all its points share, see :func:`refocused`.
+
+    Turns about the image axes count with the focal length's whole error, which is the most that a narrow view gives.
+
+    Args:
+        reference_T_cam: (4, 4).
+        focal_sigma: Standard deviation of the logarithm of both focal lengths.
+        depth_sigma: Standard deviation of the logarithm of the points' scale.
+    """
+    omega = se3.so3_log(reference_T_cam[None, :3, :3])[0]
+    focal = focal_sigma * np.concatenate([omega[:2], [0.0], reference_T_cam[:2, 3], [0.0]])
+    depth = depth_sigma * np.concatenate([np.zeros(3), reference_T_cam[:3, 3]])
+    return np.outer(focal, focal) + np.outer(depth, depth)

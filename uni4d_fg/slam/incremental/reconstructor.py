@@ -29,11 +29,11 @@ from uni4d_fg.slam.incremental.model import (
     FrameUpdate,
     Landmarks,
 )
-from uni4d_fg.slam.incremental.pose import FramePose, locate, predict
+from uni4d_fg.slam.incremental.pose import FramePose, locate, predict, refocused, shared_spread
 from uni4d_fg.slam.incremental.results import Results, ResultsInMemory, assemble_results
 from uni4d_fg.slam.incremental.smoother import make_smoother
 from uni4d_fg.slam.incremental.tracking import OnlineTracker
-from uni4d_fg.slam.incremental.window import CameraWindow, LeftLandmarks
+from uni4d_fg.slam.incremental.window import CameraWindow, LeftKeyframe, LeftLandmarks
 from uni4d_fg.slam.reconstruction import Reconstruction
 from uni4d_fg.slam.stages.scene import StaticNoise
 
@@ -170,23 +170,21 @@ class IncrementalReconstructor:
         self._append(frame, time_now, status, static, pose)
         self.num_frames, self.last_timestamp = frame + 1, time_now
         landmarks: list[Landmarks] = []
-        left: list[tuple[int, FloatArray, FloatArray, float]] = []
+        left: list[LeftKeyframe] = []
         if status is not FrameStatus.TRACKED:
             with self._timed("window"):
-                before = self.window.cue_scale
-                self.smoother.solve(self.window)
-                self._rescale(self.window.cue_scale - before)
+                self._solve_window()
             with self._timed("covariance"):
                 self.window.update_covariance()
             while self.smoother.must_slide(self.window):
                 with self._timed("marginalize"):
                     oldest, gone = self.window.slide()
-                left.append((oldest.frame, oldest.world_T_cam, oldest.covariance, oldest.log_scale))
+                left.append(oldest)
                 landmarks.append(self._colored(gone))
         self.last_pose = self._pose_of(self.pending[-1])
         with self._timed("nonrigid"):
             dynamic = self._solve_dynamic(frame, static, moving)
-        finished = tuple(f for keyframe in left for f in self._finish_keyframe(*keyframe))
+        finished = tuple(f for keyframe in left for f in self._finish_keyframe(keyframe))
         self._forget(frame)
         self.results.add(finished, tuple(landmarks))
         return_free_memory()
@@ -208,13 +206,7 @@ class IncrementalReconstructor:
         if self.num_frames:
             self._boundary.close()
         window = self.window
-        frames = [
-            finished
-            for row, keyframe in enumerate(window.frame.tolist())
-            for finished in self._finish_keyframe(
-                keyframe, window.pose[row], window.covariance[row], float(window.log_scale[row])
-            )
-        ]
+        frames = [finished for row in range(len(window)) for finished in self._finish_keyframe(window.keyframe(row))]
         landmarks: tuple[Landmarks, ...] = ()
         if len(window.landmark_track):
             landmarks = (self._colored(window.all_landmarks()),)
@@ -317,6 +309,24 @@ class IncrementalReconstructor:
                 pending.keyframe_T_cam[:3, 3] *= np.exp(log_scale)
                 pending.log_scale += log_scale
 
+    def _solve_window(self) -> None:
+        """Solve the window and let the frames that hang on its keyframes follow."""
+        window = self.window
+        hanging = [pending for pending in self.pending if pending.status is FrameStatus.TRACKED]
+        rows = {int(np.searchsorted(window.frame, pending.keyframe)) for pending in hanging}
+        depths = {row: window.log_depths(row) for row in rows}
+        scale_before, focal_before = window.cue_scale, window.intrinsics[:2]
+        self.smoother.solve(window)
+        self._rescale(window.cue_scale - scale_before)
+        ratio = focal_before / window.intrinsics[:2]
+        for row, (track, before) in depths.items():
+            seen, after = window.log_depths(row)
+            _, here, there = np.intersect1d(track, seen, assume_unique=True, return_indices=True)
+            deeper = float(np.median(after[there] - before[here])) if len(here) else 0.0
+            for pending in hanging:
+                if pending.keyframe == window.frame[row]:
+                    pending.keyframe_T_cam = refocused(pending.keyframe_T_cam, ratio, np.exp(deeper))
+
     def _bridged_frames(self) -> int:
         """Return how many of the newest frames were bridged."""
         last = bool(self.pending) and self.pending[-1].status is FrameStatus.BRIDGED
@@ -345,24 +355,28 @@ class IncrementalReconstructor:
                 by_frame[number].dynamic = points_of_frame
         return in_world(solved[frame], self.last_pose)
 
-    def _finish_keyframe(
-        self, keyframe: int, world_T_key: FloatArray, covariance: FloatArray, log_scale: float
-    ) -> Iterator[FinishedFrame]:
+    def _finish_keyframe(self, keyframe: LeftKeyframe) -> Iterator[FinishedFrame]:
         """Yield the frames that hang on a keyframe and forget them."""
-        mine = [pending for pending in self.pending if pending.keyframe == keyframe]
-        self.pending = [pending for pending in self.pending if pending.keyframe != keyframe]
+        mine = [pending for pending in self.pending if pending.keyframe == keyframe.frame]
+        self.pending = [pending for pending in self.pending if pending.keyframe != keyframe.frame]
         for pending in mine:
-            pose = se3.orthonormalize(world_T_key @ pending.keyframe_T_cam)
-            own = pending.frame == keyframe
+            pose = se3.orthonormalize(keyframe.world_T_cam @ pending.keyframe_T_cam)
+            own = pending.frame == keyframe.frame
             yield FinishedFrame(
                 pending.frame,
                 pending.timestamp,
                 pending.status,
                 pose,
-                covariance if own else se3.composed_covariance(covariance, pending.keyframe_T_cam, pending.covariance),
-                log_scale if own else pending.log_scale,
+                keyframe.covariance if own else self._hanging_covariance(keyframe, pending),
+                keyframe.log_scale if own else pending.log_scale,
                 in_world(pending.dynamic, pose),
             )
+
+    def _hanging_covariance(self, keyframe: LeftKeyframe, pending: PendingFrame) -> FloatArray:
+        """Return the covariance (6, 6) of a frame that hangs on a keyframe."""
+        depth = np.nan_to_num(keyframe.log_scale_sigma)
+        relative = pending.covariance + shared_spread(pending.keyframe_T_cam, self.window.focal_sigma, depth)
+        return se3.composed_covariance(keyframe.covariance, pending.keyframe_T_cam, relative)
 
     def _colored(self, left: LeftLandmarks) -> Landmarks:
         return Landmarks(left.track, left.point, left.error, left.count, self.book.colors(left.track))
@@ -380,7 +394,7 @@ class IncrementalReconstructor:
             newest = self.pending[-1]
             covariance = window.covariance[-1]
             if newest.status is FrameStatus.TRACKED:
-                covariance = se3.composed_covariance(covariance, newest.keyframe_T_cam, newest.covariance)
+                covariance = self._hanging_covariance(window.keyframe(len(window) - 1), newest)
         return FrameUpdate(
             status, max(self.num_frames - 1, 0), self.last_pose, covariance, window.landmark_track, window.landmark,
             dynamic, finished, landmarks, window.error_px, used, len(window), dict(self._seconds),

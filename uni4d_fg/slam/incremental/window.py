@@ -28,8 +28,10 @@ from uni4d_fg.factors.marginalization_prior import MARGINALIZATION_PRIOR, margin
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.factors.variable_types import CUE_SCALE, INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 from uni4d_fg.optim.added_factors import AddedValues, FactorSource, JoinedStage, join_additions
 from uni4d_fg.optim.cluster_robust import Clusters, Spread
+from uni4d_fg.optim.considered import Considered
 from uni4d_fg.optim.marginalization import marginalize_with_spread
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.slam.incremental.labels import LabelledFrame
@@ -38,7 +40,7 @@ from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.lifting import frame_log_scales, lift, mean_per_row
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
-from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
+from uni4d_fg.slam.stages.static_covariance import considered_focal_lengths, static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import drop_outliers, landmark_errors, measure_noise, reprojection_residual
 from uni4d_fg.slam.stages.terms import camera_motion_terms
 
@@ -69,6 +71,7 @@ class LeftKeyframe:
     world_T_cam: FloatArray
     covariance: FloatArray
     log_scale: float
+    log_scale_sigma: float
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,8 @@ class CameraWindow:
     log_scale: FloatArray = field(default_factory=lambda: np.zeros(0))
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
     """(W, 6, 6) of the last solve."""
+    log_scale_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(W,) standard deviation of the log-scales, of the last solve; NaN where unknown."""
     intrinsics_covariance: FloatArray = field(default_factory=lambda: np.full((4, 4), np.nan))
     observations: Observations = field(default_factory=no_observations)
     """Of static tracks; ``frame`` is the row in the window."""
@@ -160,6 +165,7 @@ class CameraWindow:
         self.start = np.concatenate([self.start, pose[None]])
         self.log_scale = np.append(self.log_scale, log_scale)
         self.covariance = np.concatenate([self.covariance, np.full((1, 6, 6), np.nan)])
+        self.log_scale_sigma = np.append(self.log_scale_sigma, np.nan)
         new = observations
         old = self.observations
         self.observations = Observations(
@@ -191,12 +197,15 @@ class CameraWindow:
 
     def update_covariance(self) -> None:
         """Compute the marginal covariances at the present state."""
-        _, used, joined = self._stage()
-        marginals = static_marginals(joined.stage, joined.state, self._clusters(used), self.spread)
+        considered = self._considered()
+        _, used, joined = self._stage(free_intrinsics=considered is not None or self._free_intrinsics())
+        marginals = static_marginals(joined.stage, joined.state, self._clusters(used), self.spread, considered)
         if marginals is None:
             self.covariance = np.full((len(self), 6, 6), np.nan)
+            self.log_scale_sigma = np.full(len(self), np.nan)
             return
         self.covariance = marginals.blocks(POSE, len(self))
+        self.log_scale_sigma = np.sqrt(marginals.blocks(LOG_SCALE, len(self))[:, 0, 0])
         if not self._free_intrinsics():
             return
         self.intrinsics_covariance = marginals.blocks(INTRINSICS, 1)[0]
@@ -210,16 +219,24 @@ class CameraWindow:
         leaving_landmark = self._leaving_landmarks(used)
         left = self._hand_over(state, used, leaving_landmark)
         self.prior, self.spread = self._reduce(joined, used, leaving_landmark)
-        oldest = LeftKeyframe(int(self.frame[0]), self.pose[0], self.covariance[0], float(self.log_scale[0]))
+        oldest = self.keyframe(0)
         gone = np.isin(self.observations.track, self.landmark_track[leaving_landmark]) | (self.observations.frame == 0)
         kept = self.observations.select(~gone)
         self.observations = replace(kept, frame=kept.frame - 1)
         self._keep_landmarks(~leaving_landmark)
         self.frame, self.bridged, self.pose = self.frame[1:], self.bridged[1:], self.pose[1:]
         self.log_scale, self.covariance, self.start = self.log_scale[1:], self.covariance[1:], self.start[1:]
+        self.log_scale_sigma = self.log_scale_sigma[1:]
         self.slides += 1
         self._drop_bare_landmarks()
         return oldest, left
+
+    def keyframe(self, row: int) -> LeftKeyframe:
+        """Return what is known of a keyframe at present."""
+        return LeftKeyframe(
+            int(self.frame[row]), self.pose[row], self.covariance[row],
+            float(self.log_scale[row]), float(self.log_scale_sigma[row]),
+        )  # fmt: skip
 
     def all_landmarks(self) -> LeftLandmarks:
         """Return every landmark of the window, for the end of the video."""
@@ -245,6 +262,14 @@ class CameraWindow:
         points = lift(observations, self._cameras())
         return mean_per_row(points, observations.weight, order[at[mine]], len(track))
 
+    def log_depths(self, row: int) -> tuple[IntArray, FloatArray]:
+        """Return the tracks (n,) of the landmarks that a keyframe sees, ascending, and their log-depths (n,)."""
+        seen = np.unique(self.observations.track[self.observations.frame == row])
+        known, points = self.landmarks_of(seen)
+        z = world_to_camera(np.broadcast_to(self.pose[row], (len(points), 4, 4)), points)[:, 2]
+        known &= z > NEAR_PLANE
+        return seen[known], np.log(z[known])
+
     def _start_landmarks(self) -> None:
         enough = min(self.config.incremental.min_observations, len(self))
         if len(self) < 2:
@@ -262,8 +287,31 @@ class CameraWindow:
         enough = self.slides > 0 or len(self) >= self.config.incremental.free_intrinsics_from
         return self.intrinsics_free and enough and self.config.input.intrinsics == "free"
 
-    def _stage(self) -> tuple[State, Observations, JoinedStage]:
+    def _considered(self) -> Considered | None:
+        """Return the intrinsics as a constant that is not known exactly; None where they are free, or given as exact.
+
+        Before there are enough keyframes they are as uncertain as their prior, afterwards as when they were fixed.
+        """
+        if self._free_intrinsics() or self.config.input.intrinsics != "free":
+            return None
+        if not self.intrinsics_free:
+            return Considered(INTRINSICS, self.intrinsics_covariance)
+        ba = self.config.bundle_adjustment
+        return considered_focal_lengths(self.intrinsics, ba.focal_prior_fraction, ba.aspect_prior_sigma)
+
+    @property
+    def focal_sigma(self) -> float:
+        """Standard deviation of the logarithm of the focal lengths in use."""
+        considered = self._considered()
+        covariance = self.intrinsics_covariance if considered is None else considered.covariance
+        found = float(np.sqrt(np.diag(covariance)[:2].max())) / float(self.intrinsics[0])
+        return found if np.isfinite(found) else 0.0
+
+    def _stage(self, free_intrinsics: bool | None = None) -> tuple[State, Observations, JoinedStage]:
         """Declare the solve, without what is added and with it.
+
+        Args:
+            free_intrinsics: Whether the intrinsics move; as they do in the solve when None.
 
         Returns:
             The window's own state, the observations of landmarks, tracks numbered by landmark row, and the whole solve.
@@ -277,9 +325,10 @@ class CameraWindow:
         chosen = chosen.select(np.lexsort([chosen.frame, chosen.track]))
         state = self._cameras().state(self.landmark, self.landmark_track, self.frame)
         ba = self.config.bundle_adjustment
+        free_intrinsics = self._free_intrinsics() if free_intrinsics is None else free_intrinsics
         problem = bundle_adjustment_problem(
             state, chosen, self.noise, ba, self.prior_intrinsics[None],
-            Freedom(poses=True, intrinsics=self._free_intrinsics()), camera_motion=self._motion_terms(),
+            Freedom(poses=True, intrinsics=free_intrinsics), camera_motion=self._motion_terms(),
         ).add(self._bridge_terms())  # fmt: skip
         if self.slides:  # the prior holds the gauge
             problem.free = {**problem.free, POSE: np.ones((len(self), 6), dtype=bool)}

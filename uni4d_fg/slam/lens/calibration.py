@@ -26,6 +26,8 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit
+from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom
+from uni4d_fg.slam.lens.zoom_fit import ZoomFit
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
 
@@ -54,6 +56,8 @@ class LensCalibration:
     candidates: list[LensCandidate] = field(default_factory=list)
     solves: list[SolveSummary] = field(default_factory=list)
     note: str = ""
+    zoom: ZoomCalibration | None = None
+    """What was found of a zoom; None where none was sought."""
 
     def facts(self) -> list[str]:
         """Say in words what was chosen and why."""
@@ -66,7 +70,8 @@ class LensCalibration:
             f"on held-out tracks) and moves pixels by up to {c.displacement_px:.1f} px"
             for c in self.candidates
         ]
-        return [", ".join(chosen), *([self.note] if self.note else []), *tried]
+        zoomed = [] if self.zoom is None else self.zoom.notes
+        return [", ".join(chosen), *zoomed, *([self.note] if self.note else []), *tried]
 
 
 def calibrate_lens(
@@ -102,17 +107,22 @@ def calibrate_lens(
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0
     config = settings_of_fit(config, consecutive=len(frames) == int(frames[-1]) + 1)
     fit = LensFit(config, some.without(held_out), intrinsics, run, hooks)
-    if settings.model != "auto":
+    if settings.model not in ("auto", "pinhole"):
         model = cast(LensModel, settings.model.upper())
         lens = _as_model(given or PINHOLE, model)
         found = fit.refine(fit.scene(lens, intrinsics), lens, model, settings.rounds)
         return LensCalibration(found.lens, found.intrinsics, [_candidate(found, 0.0, image_size)], fit.solves)
 
     pinhole = FittedLens(Lens(), fit.scene(Lens(), intrinsics))
+    zoom = None if settings.zoom == "off" else find_zoom(ZoomFit(fit, frames), pinhole.scene, count, settings)
+    if settings.model == "pinhole" or (zoom is not None and zoom.zoom is not None):
+        # A lens beside a zoom is not sought.
+        known = intrinsics if zoom is None or zoom.zoom is None else zoom.intrinsics
+        return LensCalibration(Lens(), known, [], fit.solves, zoom=zoom)
     evidence = fit.probe(pinhole.scene)
     if evidence < settings.min_evidence:
         note = f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"
-        return LensCalibration(Lens(), intrinsics, [], fit.solves, note)
+        return LensCalibration(Lens(), intrinsics, [], fit.solves, note, zoom)
     judge = HeldOut(config, some.without(~held_out), run, hooks)
     best, candidates = pinhole, list[LensCandidate]()
     richer: tuple[LensModel, ...] = ("SIMPLE_RADIAL", "RADIAL")
@@ -129,8 +139,8 @@ def calibrate_lens(
             break
         best = found
     if best is pinhole:
-        return LensCalibration(Lens(), intrinsics, candidates, fit.solves)
-    return LensCalibration(best.lens, best.intrinsics, candidates, fit.solves)
+        return LensCalibration(Lens(), intrinsics, candidates, fit.solves, zoom=zoom)
+    return LensCalibration(best.lens, best.intrinsics, candidates, fit.solves, zoom=zoom)
 
 
 def _as_model(lens: Lens, model: LensModel) -> Lens:

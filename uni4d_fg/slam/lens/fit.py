@@ -90,10 +90,10 @@ class LensFit:
         solver = StaticSceneSolver(self.config, self.run, self.hooks)
         ideal = ideal_tracks(self.tracks, intrinsics, lens)
         found = solver.solve(ideal, intrinsics, self.prior_intrinsics, free_intrinsics=True)
-        self._note(found.solves)
+        self.note(found.solves)
         return found
 
-    def _note(self, solves: list[SolveSummary]) -> None:
+    def note(self, solves: list[SolveSummary]) -> None:
         """Remember solves. Raises Cancelled if the user interrupted one."""
         self.solves += solves
         if any(solve.termination is Termination.CANCELLED for solve in solves):
@@ -114,9 +114,9 @@ class LensFit:
                 continue
         if not fits:
             raise DegenerateProblemError("the lens: no start of the search gives cameras; give the camera model")
-        return min(fits, key=self.energy_per_track)
+        return min(fits, key=self.energy)
 
-    def energy_per_track(self, fit: FittedLens) -> float:
+    def energy(self, fit: FittedLens) -> float:
         """Return the robust reprojection energy of a fit on real pixels, dropped observations counted as lost."""
         seen = fit.scene.observations
         _, row = seen.rows()
@@ -124,7 +124,7 @@ class LensFit:
         sigma = self.config.bundle_adjustment.reprojection_sigma_px
         kept = np.log1p(np.minimum(error / sigma, _FAR) ** 2).sum()
         lost = int((self.tracks.weight > 0).sum()) - len(seen)
-        return float(kept + lost * np.log1p(_FAR**2)) / max(len(self.tracks.label), 1)
+        return float(kept + lost * np.log1p(_FAR**2))
 
     def refine(self, start: StaticScene, lens: Lens, model: LensModel, rounds: int = 1) -> FittedLens:
         """Solve everything together; between rounds stages 1 and 2 judge outliers anew.
@@ -168,11 +168,11 @@ class LensFit:
         pixel = [] if ba.free_principal_point else [2, 3]
         held = Stage("lens", replace(problem).fix(variable, entries=[*pixel, 4, 5, 6, 7]), solver, part="held")
         state, before = self.run(held, state, self.hooks)
-        self._note([before])
+        self.note([before])
         unused = range(4 + len(PARAMETERS[model]), 8)
         free = Stage("lens", replace(problem).fix(variable, entries=[*pixel, *unused]), solver, part=model)
         state, after = self.run(free, state, self.hooks)
-        self._note([after])
+        self.note([after])
         camera = state[variable][0]
         cameras = Cameras(state[POSE], camera[:4], state[LOG_SCALE][:, 0])
         moved = replace(scene, cameras=cameras, landmarks=state[LANDMARK])

@@ -39,3 +39,20 @@ def ideal_weight(lens: Lens, intrinsics: FloatArray, ideal: FloatArray) -> Float
     with np.errstate(invalid="ignore"):
         size: FloatArray = np.clip(lens.magnification(intrinsics, ideal), 1e-6, 1.0)
     return size
+
+
+def unzoomed_tracks(labelled: LabelledTracks, intrinsics: FloatArray, zoom: FloatArray) -> LabelledTracks:
+    """Move every observation to where a camera without zoom would have seen it.
+
+    A pixel of a shorter focal length is less sure on that camera: weights are lowered by the area it covers there.
+
+    Args:
+        labelled: Observations on real pixels.
+        intrinsics: (4,) px, of the longest focal length; the principal point is the center of the zoom.
+        zoom: (T,) log focal length of each frame over that of the intrinsics, not positive.
+    """
+    tracks, center = labelled.tracks, intrinsics[2:]
+    factor = np.exp(-zoom)[None, :, None]
+    uv = (center + (tracks.uv - center) * factor).astype(np.float32)
+    weight = labelled.weight * np.exp(2.0 * zoom)[None].astype(np.float32)
+    return replace(labelled, tracks=replace(tracks, uv=uv), weight=weight.astype(np.float32))

@@ -29,6 +29,7 @@ from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.acceleration import AccelerationPrior, estimate_prior, starting_prior
 from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
+from uni4d_fg.slam.stages.frame_noise import weigh_by_frame
 from uni4d_fg.slam.stages.lifting import lift, mean_per_row
 from uni4d_fg.slam.stages.merging import FindFragments, MergedTracks, merge_tracks
 from uni4d_fg.slam.stages.observations import Observations
@@ -238,6 +239,8 @@ def adjust_bundle(
                 "check intrinsics and masks, or raise max_reprojection_px and max_depth_ratio"
             )
         noise = measure_noise(state, observations, noise, config)
+        if index < rounds - 1:
+            observations = weigh_by_frame(state, observations, len(state[POSE]), config)
         if find_fragments is not None and index < rounds - 1:
             state, observations, merged = merge_tracks(state, observations, find_fragments(state, observations, noise))
     if config.structure == "refine" and energy.is_likelihood and solves[-1].termination is not Termination.CANCELLED:

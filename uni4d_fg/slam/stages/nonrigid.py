@@ -28,6 +28,7 @@ from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
 from uni4d_fg.slam.stages.lifting import lift
 from uni4d_fg.slam.stages.neighbors import nearest_neighbors
 from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.proximal import proximal_term
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise
 
 
@@ -248,7 +249,12 @@ def solve_nonrigid(
         empty = np.zeros((0, num_frames))
         return DynamicScene(empty[..., None] + np.zeros(3), empty > 0, mesh.track, mesh.instance, None, dropped)
     problem = nonrigid_problem(state, mesh, observations, rows, cameras, noise, config, energy)
-    state, summary = run(Stage("nonrigid", problem, config.solver, schedules=_schedules(config)), state, hooks)
+    bounds: frozenset[str] = frozenset()
+    if config.proximal_weight > 0:
+        bound = proximal_term(observations, rows, cameras, noise.depth_sigma, config, energy)
+        problem, bounds = problem.add(bound), frozenset({bound.name})
+    stage = Stage("nonrigid", problem, config.solver, schedules=_schedules(config), bounds=bounds)
+    state, summary = run(stage, state, hooks)
     points = np.full((*mesh.row.shape, 3), np.nan)
     points[mesh.row >= 0] = state[DYNAMIC_POINT]
     near, calm = spatial_inliers(points, mesh, config), energy_inliers(points, mesh, config)

@@ -25,6 +25,7 @@ from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.se3 import inverse_right_jacobian, se3_log
 from uni4d_fg.optim.cluster_robust import MIN_CLUSTERS, Spread
+from uni4d_fg.optim.few_clusters import blend
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.added_terms import FRAME, AddedTerms, Entries
 from uni4d_fg.slam.windows.plan import Window
@@ -201,8 +202,8 @@ def _covariances(
 ) -> tuple[FloatArray, FloatArray]:
     """Return pose (T, 6, 6) and intrinsics (4, 4) covariances; see :mod:`uni4d_fg.optim.cluster_robust`.
 
-    The sum over clusters, and over factors without landmarks, is taken through one solve per cluster and one per
-    direction in which a window's other factors, or an added one, know anything.
+    The sum over clusters, over factors without landmarks, and over all as if they were independent, is taken through
+    one solve per cluster and one per direction in which a window's factors, or an added one, know anything.
     """
     num_frames = len(cameras.world_T_cam)
     base = FRAME * num_frames + 4
@@ -214,15 +215,12 @@ def _covariances(
     if added is not None:
         entries += added.linearize(cameras)[1]
     solver = _factorize(entries, size, at)
-    poses, intrinsics = np.zeros((num_frames, 6, 6)), np.zeros((4, 4))
 
-    def add(sides: FloatArray, factor: float = 1.0) -> None:
-        """Add the outer products of the solutions of (m, size) right-hand sides."""
+    def solutions(sides: FloatArray) -> FloatArray:
+        """Return the solutions of (m, size) right-hand sides."""
         solved = np.zeros_like(sides)
         solved[:, at] = solver.solve(np.ascontiguousarray(sides[:, at].T)).T
-        frames = solved[:, : base - 4].reshape(len(sides), num_frames, FRAME)[:, :, :6]
-        poses[:] += factor * np.einsum("mti,mtj->tij", frames, frames, optimize=True)
-        intrinsics[:] += factor * solved[:, base - 4 : base].T @ solved[:, base - 4 : base]
+        return solved[:, :base]
 
     spreads = [part.spread for part in information]
     scores = None
@@ -233,21 +231,53 @@ def _covariances(
             assert part.spread is not None
             scores[:, part.columns(num_frames)] += part.spread.scores @ j
         used = int(np.any(scores != 0.0, axis=1).sum())
-        if used < MIN_CLUSTERS:
-            scores = None
-        else:
-            add(scores, used / (used - 1.0))
+        scores = np.sqrt(used / (used - 1.0)) * scores if used >= MIN_CLUSTERS else None
+    rest, model = _Squares(num_frames), _Squares(num_frames)
     calibrated = np.zeros((4, size))
     calibrated[:, base - 4 : base] = _root(known)
-    add(calibrated)
+    for sum_of in (rest, model):
+        sum_of.add(solutions(calibrated))
     for part, j in zip(information, jacobians, strict=True):
-        rest = part.curvature if scores is None or part.spread is None else part.spread.rest
-        sides = np.zeros((len(rest), size))
-        sides[:, part.columns(num_frames)] = _root(rest) @ j
-        add(sides[np.any(sides != 0.0, axis=1)])
+        model.add(solutions(_sides(part, part.curvature, j, num_frames, size)))
+        if scores is not None and part.spread is not None:
+            rest.add(solutions(_sides(part, part.spread.rest, j, num_frames, size)))
     for sides in () if added is None else added.root_rows(cameras):
-        add(sides)
-    return poses, intrinsics
+        rest.add(solutions(sides))
+        model.add(solutions(sides))
+    if scores is None:
+        return model.poses, model.intrinsics
+    influence, clusters = solutions(scores), _Squares(num_frames)
+    clusters.add(influence)
+    weights = blend(_twists(influence, num_frames), model.poses, rest.poses)
+    return (
+        weights.clusters * clusters.poses + weights.model * (model.poses - rest.poses) + rest.poses,
+        weights.clusters * clusters.intrinsics + weights.model * (model.intrinsics - rest.intrinsics) + rest.intrinsics,
+    )
+
+
+class _Squares:
+    """Sums of squares of solutions: marginal covariances of every pose and of the intrinsics."""
+
+    def __init__(self, num_frames: int) -> None:
+        self.poses, self.intrinsics = np.zeros((num_frames, 6, 6)), np.zeros((4, 4))
+
+    def add(self, solved: FloatArray) -> None:
+        """Add the outer products of solutions (m, 7 T + 4)."""
+        twists = _twists(solved, len(self.poses))
+        self.poses += np.einsum("mti,mtj->tij", twists, twists, optimize=True)
+        self.intrinsics += solved[:, -4:].T @ solved[:, -4:]
+
+
+def _twists(solved: FloatArray, num_frames: int) -> FloatArray:
+    """Return the poses' part (m, T, 6) of solutions (m, 7 T + 4)."""
+    return solved[:, :-4].reshape(len(solved), num_frames, FRAME)[:, :, :6]
+
+
+def _sides(part: WindowInformation, matrix: FloatArray, jacobian: FloatArray, num_frames: int, size: int) -> FloatArray:
+    """Return rows (m, size) whose squares are a window's matrix on the shared cameras."""
+    sides = np.zeros((len(matrix), size))
+    sides[:, part.columns(num_frames)] = _root(matrix) @ jacobian
+    return sides[np.any(sides != 0.0, axis=1)]
 
 
 def _root(matrix: FloatArray) -> FloatArray:

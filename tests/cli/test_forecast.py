@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uni4d_fg.cli.forecast import Forecast, ForecastReporter, Share, expected_shares
+from uni4d_fg.cli.progress import left, progress_reporter
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.plan import CuePlan
+from uni4d_fg.progress import SilentReporter
+
+SIZE = (480, 640)
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def simulated(shares: list[Share], really: list[float], measured: set[str]) -> list[tuple[float, float | None]]:
+    """Play a run whose tasks take so long; return its moments: the part of the time, and the total that was told."""
+    clock = Clock()
+    reporter = ForecastReporter(SilentReporter(), Forecast(shares, clock))
+    whole, told = sum(really), []
+    for share, seconds in zip(shares, really, strict=True):
+        reporter.begin(share.task, 50 if share.task in measured else None)
+        for step in range(1, 51):
+            clock.now += seconds / 50
+            reporter.advance(step)
+            passed = clock.now - 100.0
+            rest = reporter.forecast.state()[1]
+            told.append((passed / whole, None if rest is None else passed + rest))
+        reporter.end()
+    return told
+
+
+@pytest.mark.parametrize("pace", [0.2, 1.0, 7.0])
+def test_a_run_of_the_expected_shares_is_told_at_any_pace(pace: float) -> None:
+    shares = expected_shares(60, SIZE, Config(), CuePlan(depth="geometry", masks="motion"), has_tracks=False)
+    really = [pace * share.seconds for share in shares]
+    told = simulated(shares, really, {"tracks", "fusion", "depth maps"})
+    later = [total for part, total in told if part > 0.1]
+    assert len(later) > 100
+    assert all(total is not None for total in later)
+    ratio = np.array([total for total in later if total is not None]) / sum(really)
+    assert ratio.max() < 1.5
+    assert ratio.min() > 1 / 1.5
+
+
+def test_shares_that_are_off_by_a_third_each_still_tell_the_time(rng: np.random.Generator) -> None:
+    shares = expected_shares(60, SIZE, Config(), CuePlan(), has_tracks=False)
+    for _ in range(20):
+        really = [share.seconds * float(np.exp(rng.uniform(-0.25, 0.25))) for share in shares]
+        told = simulated(shares, really, {"tracks", "fusion"})
+        for part, total in told:
+            if part > 0.1:
+                assert total is not None
+                assert 1 / 1.7 < total / sum(really) < 1.7
+
+
+def test_tasks_that_are_left_out_or_unknown_do_no_harm() -> None:
+    clock = Clock()
+    forecast = Forecast([Share("a", 10), Share("b", 30), Share("a", 20), Share("c", 40)], clock)
+    assert forecast.state() == (0.0, None)
+    forecast.begin("a", 10)
+    clock.now += 5
+    forecast.advance(0.5)
+    assert forecast.state() == (pytest.approx(0.05), None)
+    forecast.begin("unheard of", None)
+    clock.now += 500
+    assert forecast.state() == (pytest.approx(0.1), pytest.approx(45.0))
+    forecast.begin("a", 10)
+    # The share between is left out: it will not come any more.
+    assert forecast.state()[0] == pytest.approx(10 / 70)
+    clock.now += 10
+    forecast.advance(1.0)
+    forecast.end()
+    assert forecast.state() == (pytest.approx(30 / 70), pytest.approx(20.0))
+    forecast.begin("c", None)
+    clock.now += 1000
+    part, rest = forecast.state()
+    assert part < 1.0
+    assert rest is not None
+    assert rest > 0
+    forecast.end()
+    assert forecast.state()[0] == pytest.approx(1.0)
+
+
+def test_lines_say_how_long_it_will_take(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    forecast = Forecast([Share("a", 10), Share("b", 30)], clock)
+    with progress_reporter(False, forecast) as reporter:
+        reporter.begin("a", 10)
+        clock.now += 20
+        reporter.end("fine")
+    assert left(forecast) == "about 1 min 0 s left"
+    assert capsys.readouterr().err.endswith("fine, about 1 min 0 s left\n")

@@ -1,0 +1,170 @@
+"""The start of structure from motion: what competes, what is taken out, and what is said to be open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, tracked
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure.epipolar import epipolar_outliers
+from uni4d_fg.cues.structure.first_pair import FramePair
+from uni4d_fg.cues.structure.focal_interval import design_effect, focal_interval
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.growth import grow, misfits
+from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, Part, distinct, trial_frames
+from uni4d_fg.cues.structure.judging import held_out
+from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.cues.structure.rivals import rotation_difference
+from uni4d_fg.geometry import se3
+from uni4d_fg.progress import SilentReporter
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+
+CONFIG = load_config("default", [])
+FRAMES = 20
+
+
+def found(scene: TrackedScene) -> Structure:
+    structure = structure_from_motion(
+        scene.observations, len(scene.world_T_cam), SIZE, GUESS, CONFIG, SilentReporter(), lambda: False
+    )
+    assert structure is not None
+    return structure
+
+
+def error_of(structure: Structure, scene: TrackedScene) -> tuple[float, float]:
+    """ATE as a part of the path's extent, and degrees per frame."""
+    metrics = evaluate_trajectory(structure.world_T_cam, scene.world_T_cam)
+    extent = np.linalg.norm(np.ptp(scene.world_T_cam[:, :3, 3], axis=0))
+    assert metrics.rpe_rotation_deg is not None
+    return metrics.ate_m / extent, metrics.rpe_rotation_deg
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_a_large_thing_near_the_camera_does_not_become_the_world(seed: int) -> None:
+    scene = tracked(sideways(FRAMES), seed, points=1500, moving=350)
+    share = scene.moves[scene.observations.track].mean()
+    assert share > 0.35  # and as much of the picture
+    structure = found(scene)
+    path, turn = error_of(structure, scene)
+    assert path < 0.01
+    assert turn < 0.1
+    np.testing.assert_allclose(structure.intrinsics[:2], K[:2], rtol=0.03)
+    assert structure.focal.low <= K[0] <= structure.focal.high
+
+
+def test_tracks_of_the_thing_disagree_with_the_picture() -> None:
+    scene = tracked(sideways(FRAMES), 3, points=1500, moving=350, size=0.6)
+    tracks, _ = scene.observations.rows()
+    outlier = epipolar_outliers(scene.observations, FRAMES, SIZE, CONFIG.geometric_depth)
+    moves = scene.moves[tracks]
+    assert outlier[moves].mean() > 0.6
+    assert outlier[~moves].mean() < 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_forward_motion_leaves_the_focal_length_open_in_an_interval_that_holds_it(seed: int) -> None:
+    scene = tracked(forward(FRAMES), seed, noise_px=0.5)
+    structure = found(scene)
+    below, above = structure.focal.relative(float(structure.intrinsics[0]))
+    assert above - below > 0.04
+    assert structure.focal.low <= K[0] <= structure.focal.high
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_turning_camera_tells_the_focal_length(seed: int) -> None:
+    structure = found(tracked(sideways(FRAMES), seed))
+    below, above = structure.focal.relative(float(structure.intrinsics[0]))
+    assert above - below < 0.2
+    assert structure.focal.low <= K[0] <= structure.focal.high
+
+
+def scene_of(tracks: TrackedScene, intrinsics: np.ndarray = K) -> GrowingScene:
+    return GrowingScene.empty(
+        tracks.observations, FRAMES, intrinsics, CONFIG, free_focal=True, prior_intrinsics=intrinsics,
+        should_stop=lambda: False,
+    )  # fmt: skip
+
+
+def test_a_bad_pair_loses_and_an_unusual_focal_length_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracks = tracked(sideways(FRAMES), 4, points=60)
+    nothing = np.zeros(len(tracks.observations), dtype=bool)
+    competition = Competition(tracks.observations, nothing, FRAMES, SIZE, GUESS, CONFIG, True, lambda: False)
+    pairs = [FramePair(3, 4, 2.0, 300), FramePair(5, 13, 30.0, 200), FramePair(6, 19, 30.0, 100)]
+    left = {pairs[0]: 0.5, pairs[1]: 0.22, pairs[2]: 0.1}
+    tried = []
+
+    def trial(pair: FramePair, factor: float, part: Part) -> Hypothesis:
+        tried.append((pair, factor))
+        is_usual = pair != pairs[2]
+        return Hypothesis(pair, factor, part, scene_of(tracks), np.arange(FRAMES), left[pair], is_usual)
+
+    monkeypatch.setattr(competition, "pairs", lambda _: pairs)
+    monkeypatch.setattr(competition, "trial", trial)
+    assert [h.pair for h in competition.run()] == [pairs[1], pairs[1], pairs[1], pairs[2], pairs[0]]
+    # Other focal lengths are tried from the best pair.
+    assert tried[3:] == [(pairs[1], 0.75), (pairs[1], 1.4)]
+
+
+def test_views_that_fit_badly_are_taken_out_and_posed_again() -> None:
+    tracks = tracked(sideways(FRAMES), 5)
+    scene = scene_of(tracks)
+    assert scene.start(FramePair(4, 12, 30.0, 200)) > 50
+    grow(scene, SilentReporter())
+    assert scene.registered.all()
+    assert len(misfits(scene)) == 0
+    right = scene.world_T_cam.copy()
+    scene.world_T_cam[9, :3, :3] = right[9, :3, :3] @ se3.so3_exp(np.array([0.0, 0.2, 0.1]))
+    scene.world_T_cam[17, :3, 3] += 0.3
+    scene._judge()
+    np.testing.assert_array_equal(misfits(scene), [9, 17])
+    scene.take_out(misfits(scene))
+    assert not scene.registered[[9, 17]].any()
+    grow(scene, SilentReporter())
+    assert scene.registered.all()
+    degrees, _ = rotation_difference(scene.world_T_cam, right, np.arange(FRAMES))
+    assert degrees < 0.05
+    np.testing.assert_allclose(scene.world_T_cam[[9, 17]], right[[9, 17]], atol=0.01)
+
+
+def test_what_is_held_out_leaves_both_ends_of_every_track() -> None:
+    observations = tracked(sideways(FRAMES), 6, points=60).observations
+    out = held_out(observations, 4)
+    assert 0.12 < out.mean() < 0.25
+    first = np.flatnonzero(np.diff(observations.track, prepend=-1))
+    last = np.append(first[1:] - 1, len(observations) - 1)
+    assert not out[first].any()
+    assert not out[last].any()
+
+
+def test_errors_that_are_alike_count_once(rng: np.random.Generator) -> None:
+    group = np.repeat(np.arange(300), 10)
+    alone = rng.normal(0, 1, (3000, 2))
+    assert design_effect(alone, group) == pytest.approx(1.0, abs=0.15)
+    alike = np.repeat(rng.normal(0, 1, (300, 2)), 10, axis=0)
+    assert design_effect(alike, group) == pytest.approx(10.0, rel=0.02)
+
+
+def test_a_held_focal_length_is_not_open() -> None:
+    scene = scene_of(tracked(sideways(FRAMES), 7))
+    scene.free_focal = False
+    scene.start(FramePair(4, 12, 30.0, 200))
+    grow(scene, SilentReporter())
+    interval = focal_interval(scene, SIZE)
+    assert interval.low == interval.high == pytest.approx(K[0])
+
+
+def test_frames_of_a_trial_hold_the_pair_and_lie_around_it() -> None:
+    pair = FramePair(30, 46, 30.0, 100)
+    frames = trial_frames(pair, 300, 8, 24)
+    assert len(frames) == 24
+    assert {30, 46} <= set(frames.tolist())
+    assert frames[0] == 16
+    assert frames[-1] == 62
+    np.testing.assert_array_equal(trial_frames(FramePair(0, 2, 9.0, 50), 4, 8, 24), [0, 1, 2, 3])
+
+
+def test_pairs_that_compete_lie_apart() -> None:
+    pairs = [FramePair(a, b, 30.0, 100) for a, b in ((0, 10), (1, 11), (0, 9), (20, 30), (22, 30))]
+    assert [(p.first, p.second) for p in distinct(pairs, 2)] == [(0, 10), (20, 30)]
+    assert len(distinct(pairs, 4)) == 4

@@ -1,0 +1,151 @@
+"""Tables: averages as the protocols weigh them, failures counted, four forms, printed numbers marked."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import pytest
+
+from uni4d_fg.errors import ConfigError
+from uni4d_fg.pipeline.benchmark.grid import PAPER, configurations, read_grid
+from uni4d_fg.pipeline.benchmark.published import read_published
+from uni4d_fg.pipeline.benchmark.table import Column, Row, Table, latex_text
+from uni4d_fg.pipeline.benchmark.tables import Method, all_tables
+from uni4d_fg.pipeline.benchmark.task import Configuration, Task, TaskResult, stored_result
+
+
+def depth_scores(abs_rel: float, pixels: int) -> dict[str, object]:
+    part = {"abs_rel": abs_rel, "delta_125": 1.0 - abs_rel, "pixels": pixels, "missing": 0}
+    return {"protocol": "uni4d-scale", "text": "how", "scale": 1.0, "shift": 0.0, "regions": {"all": part}}
+
+
+def result(video: str, ate: float, abs_rel: float, pixels: int) -> TaskResult:
+    poses = {"ate": ate, "rpe_translation": ate / 2, "rpe_rotation_deg": 1.0, "poses": 5, "missing": 0}
+    scores = {"poses": {"sim3": poses}, "depth": {"uni4d-scale": depth_scores(abs_rel, pixels)}}
+    scores |= {"stages": {"camera_init": {"poses": {"sim3": poses | {"ate": 2 * ate}}}}}
+    scores |= {"depth_cue": {"depth": {"uni4d-scale": depth_scores(2 * abs_rel, pixels)}}}
+    return TaskResult("", video, "ours", None, 10, scores, {"nonrigid": 2.0, "fusion": 1.0}, 100.0)
+
+
+@pytest.fixture
+def tables() -> dict[str, Table]:
+    results = {
+        "a": result("a", 0.1, 0.2, 100), "b": result("b", 0.3, 0.4, 300), "c": TaskResult("", "c", "ours", "no depth")
+    }  # fmt: skip
+    found = all_tables("sintel", "Sintel", [Method("ours", results)], ("sim3",), ("uni4d-scale",), read_published())
+    return {table.name: table for table in found}
+
+
+def row_of(table: Table, name: str) -> Row:
+    return next(row for row in table.rows if row.name == name)
+
+
+def test_averages_count_failures_and_weigh_as_the_protocol_says(tables: dict[str, Table]) -> None:
+    poses, depth = row_of(tables["poses-sim3"], "ours"), row_of(tables["depth-uni4d-scale"], "ours")
+    assert poses.values["ATE"] == pytest.approx(0.2)
+    assert (poses.values["videos"], poses.values["failed"]) == (2, 1)
+    assert depth.values["AbsRel"] == pytest.approx((0.2 * 100 + 0.4 * 300) / 400)
+    assert (depth.values["videos"], depth.values["failed"]) == (2, 1)
+    assert row_of(tables["depth-uni4d-scale"], "depth cue").values["AbsRel"] == pytest.approx(0.7)
+    assert row_of(tables["stages-sim3"], "ours, after camera init").values["ATE"] == pytest.approx(0.4)
+    assert row_of(tables["runtime"], "ours").values["all"] == pytest.approx(3.0)
+    assert row_of(tables["depth-uni4d-scale"], "depth cue").values["failed"] == 1
+    assert row_of(tables["poses-sim3-videos"], "c").values == {"ours": None}
+    assert "tracks" not in tables  # counts alone make no table
+
+
+def test_printed_numbers_are_marked_and_say_where_they_are_from(tables: dict[str, Table]) -> None:
+    text = tables["poses-sim3"].markdown()
+    assert "| Uni4D (published) | 0.110 | 0.032 | 0.338 | – | – |" in text
+    assert "CasualSAM, MonST3R, Uni4D, Uni4D*: Uni4D (arXiv 2503.21761), table 1" in text
+    assert "| MonST3R (published) | 0.344 | 0.559 |" in tables["depth-uni4d-scale"].markdown()
+
+
+def test_four_forms_hold_the_same() -> None:
+    rows = [Row("a_1 & 50%", {"ATE": 0.12345, "n": 3}), Row("b", {"ATE": 0.2, "n": None}, "read", "x")]
+    table = Table("t", "Title", "method", [Column("ATE"), Column("n", better="")], rows)
+    assert "| a_1 & 50% | 0.123 | 3 |" in table.markdown()
+    latex = table.latex()
+    assert r"a\_1 \& 50\% & \textbf{0.123} & 3 \\" in latex
+    assert latex.count(r"\toprule") == latex.count(r"\bottomrule") == 1
+    read = list(csv.DictReader(io.StringIO(table.comma_separated())))
+    assert (read[0]["method"], float(read[0]["ATE"]), read[1]["kind"]) == ("a_1 & 50%", 0.12345, "read")
+    assert table.data()["rows"][0]["values"] == {"ATE": 0.12345, "n": 3}
+    assert latex_text("δ<1.25 {x}") == r"δ$<$1.25 \{x\}"
+
+
+def test_the_package_has_every_number_of_the_papers_tables() -> None:
+    found = read_published()
+    assert len(found) == 3 * 7 + 3 * 8 + 3 * 2 + 2
+    uni4d = {(p.dataset, p.protocol): p.values for p in found if p.method == "Uni4D"}
+    assert uni4d["kitti", "uni4d-scale-shift"] == pytest.approx({"AbsRel": 0.098, "δ<1.25": 0.897})
+    assert uni4d["tum-dynamics", "sim3"] == {"ATE": 0.012, "RPE trans": 0.004, "RPE rot": 0.335}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: [1", "- {dataset: x}",
+        "- {dataset: s, protocol: p, columns: [A, B], source: x, percent: [], rows: {m: [1]}}",
+    ],
+)  # fmt: skip
+def test_a_damaged_file_of_printed_numbers_is_named(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "p.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"p\.yaml"):
+        read_published(path)
+
+
+def test_a_grid_gives_rows_and_all_combinations(tmp_path: Path) -> None:
+    path = tmp_path / "grid.yaml"
+    path.write_text(
+        "base: {set: [output.clouds=false]}\nrows: {whole: {}, known: {intrinsics: known}}\n"
+        "grid: {preset: [default, fast], nonrigid.arap_weight: [0, 5.0]}\n"
+    )
+    found = {c.name: c for c in read_grid(path)}
+    assert list(found)[:2] == ["whole", "known"]
+    assert len(found) == 6
+    assert found["known"].intrinsics == "known"
+    both = found["preset fast, arap_weight 5.0"]
+    assert (both.preset, both.changes) == ("fast", ("output.clouds=false", "nonrigid.arap_weight=5.0"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rows: {a: {presets: x}}", "presets"),
+        ("rows: {a: {preset: nosuch}}", "nosuch"),
+        ("rows: {a: {set: [nonrigid.nosuch=1]}}", "nosuch"),
+        ("rows: {a: {masks: maybe}}", "masks"),
+        ("rows: {}", "neither rows nor a grid"),
+        ("rows: [1]", "rows"),
+        ("rows: {'.a': {}}", "name of a folder"),
+        ("rows: {a: {}}\nmore: 1", "more"),
+    ],
+)
+def test_a_wrong_grid_is_named(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "grid.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_grid(path)
+
+
+def test_the_papers_ablations_are_valid() -> None:
+    assert len(configurations(list(PAPER.items()), {}, "ablate")) == len(PAPER)
+
+
+def test_a_stored_result_counts_only_for_its_own_task(tmp_path: Path) -> None:
+    task = Task("sintel", "root", "a", Configuration("x"), str(tmp_path))
+    assert stored_result(task) is None
+    TaskResult(task.key, "a", "x", notes=("n",)).save(task.result_file)
+    found = stored_result(task)
+    assert found is not None
+    assert found.notes == ("n",)
+    other = Task("sintel", "root", "a", Configuration("x", changes=("solver=adam",)), str(tmp_path))
+    assert stored_result(other) is None
+    TaskResult(task.key, "a", "x", failed="why").save(task.result_file)
+    assert stored_result(task) is None
+    task.result_file.write_text("{")
+    assert stored_result(task) is None

@@ -1,0 +1,118 @@
+"""Plane sweep: the C++ version against NumPy, and both against a scene whose depth is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from uni4d_fg.config.multiview import MultiviewConfig
+from uni4d_fg.optim.extension import find_extension
+from uni4d_fg.results.fusion.multiview.sweep import Swept, sweep
+from uni4d_fg.results.fusion.multiview.sweep_numpy import sweep_numpy
+
+HEIGHT, WIDTH, FOCAL = 60, 80, 80.0
+K = np.array([FOCAL, FOCAL, 39.5, 29.5])
+SETTINGS = {"radius": 2, "noise": 0.01, "small_step": 6, "large_step": 100, "edge_contrast": 0.03}
+
+
+def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A smooth pattern in [0, 1] without repetition."""
+    waves = [np.sin(a * x + b * y + c) for a, b, c in ((9, 2, 0), (-3, 11, 1), (17, 13, 2), (5, -21, 3), (23, 7, 4))]
+    return np.asarray(0.5 + 0.09 * np.sum(waves, axis=0), np.float32)
+
+
+def view(pose: np.ndarray, box: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Image and depth of a slanted wall, with a nearer board in front of it, seen without rotation."""
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    x, y = (u - K[2]) / FOCAL, (v - K[3]) / FOCAL
+    ox, oy, oz = pose[:3, 3]
+    z = (3.0 + 0.5 * ox - oz) / (1.0 - 0.5 * x)  # the wall Z = 3 + X / 2
+    image = texture(ox + x * z, oy + y * z)
+    near = 1.6 - oz
+    on_board = box & (np.abs(ox + x * near + 0.2) < 0.25) & (np.abs(oy + y * near) < 0.3)
+    image = np.where(on_board, texture(5 + 1.3 * (ox + x * near), oy + y * near), image)
+    return image.astype(np.float32), np.where(on_board, near, z)
+
+
+def at(x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def swept(poses: list[np.ndarray], image: np.ndarray) -> Swept:
+    planes = np.linspace(0.2, 0.8, 48)
+    return sweep(image, [view(p)[0] for p in poses], [np.linalg.inv(p) for p in poses], K, planes, MultiviewConfig())
+
+
+def relative_error(found: Swept, truth: np.ndarray) -> np.ndarray:
+    return np.abs(1.0 / found.inverse_depth / truth - 1.0)[3:-3, 3:-3]
+
+
+@pytest.mark.parametrize("motion", ["sideways", "forward"])
+def test_depth_of_a_known_scene(motion: str) -> None:
+    steps = [at(0, 0, z) for z in (0.3, 0.4, -0.4)]
+    if motion == "sideways":
+        steps = [at(0.25), at(-0.25), at(0.0, 0.25), at(0.15)]
+    image, truth = view(at(0.0))
+    error = relative_error(swept(steps, image), truth)
+    bound = 0.01 if motion == "sideways" else 0.03  # forward, the middle of the image does not move
+    assert np.median(error) < bound
+    assert np.mean(error < 0.05) > (0.9 if motion == "sideways" else 0.65)
+
+
+def test_what_is_marked_moving_is_not_matched() -> None:
+    image, truth = view(at(0.0))
+    poses = [at(0.25), at(-0.25)]
+    others = []
+    for pose in poses:
+        other = view(pose)[0]
+        other[20:40, 30:50] = np.nan
+        others.append(other)
+    found = sweep(image, others, [np.linalg.inv(p) for p in poses], K, np.linspace(0.2, 0.8, 48), MultiviewConfig())
+    assert np.isfinite(found.inverse_depth).all()
+    assert np.mean(relative_error(found, truth) < 0.05) > 0.8
+
+
+def test_cpp_and_numpy_agree(rng: np.random.Generator) -> None:
+    core, reason = find_extension()
+    if core is None or not hasattr(core, "plane_sweep"):
+        pytest.skip(reason or "the extension has no plane sweep")
+    poses = [at(0.1, 0.02, 0.05), at(-0.12), at(0.02, -0.1)]
+    image = view(at(0.0))[0]
+    image[10:14, 10:20] = np.nan
+    others = np.stack([view(pose)[0] for pose in poses])
+    others += 0.005 * rng.standard_normal(others.shape).astype(np.float32)
+    others[1, 30:34, 5:9] = np.nan
+    camera = np.array([[FOCAL, 0, K[2]], [0, FOCAL, K[3]], [0, 0, 1]])
+    turn = cv2.Rodrigues(np.array([0.01, -0.02, 0.03]))[0]
+    turns = np.stack([camera @ (turn if i == 0 else np.eye(3)) @ np.linalg.inv(camera) for i in range(3)])
+    shifts = np.stack([camera @ -pose[:3, 3] for pose in poses])
+    planes = np.linspace(0.2, 0.8, 40)
+    slow = sweep_numpy(image, others, turns, shifts, planes, **SETTINGS)
+    fast = core.plane_sweep(
+        image.astype(np.float64), others.astype(np.float64), turns, shifts, planes, threads=2, **SETTINGS
+    )
+    one = core.plane_sweep(
+        image.astype(np.float64), others.astype(np.float64), turns, shifts, planes, threads=1, **SETTINGS
+    )
+    for a, b in zip(fast, one, strict=True):
+        np.testing.assert_array_equal(a, b)
+    # Costs are rounded to whole numbers, where float32 sums in another order may differ by one.
+    assert np.mean(np.abs(slow[0] - fast[0]) < 0.05) > 0.995
+    for a, b in zip(slow[1:], fast[1:], strict=True):
+        assert np.mean(np.abs(a - b) <= 8) > 0.99
+
+
+def test_bad_input_is_named() -> None:
+    core, reason = find_extension()
+    if core is None or not hasattr(core, "plane_sweep"):
+        pytest.skip(reason or "the extension has no plane sweep")
+    image = np.zeros((20, 20))
+    with pytest.raises(ValueError, match="others"):
+        core.plane_sweep(
+            image, np.zeros((1, 20, 19)), np.eye(3)[None], np.zeros((1, 3)), np.linspace(0.1, 1, 8), **SETTINGS
+        )
+    with pytest.raises(ValueError, match="inverse_depth"):
+        core.plane_sweep(image, image[None], np.eye(3)[None], np.zeros((1, 3)), np.ones(2), **SETTINGS)

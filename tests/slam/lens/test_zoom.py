@@ -1,0 +1,166 @@
+"""A zoom, found with the cameras, on synthetic scenes: every frame's focal length comes out, and none where none is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from zooming import ramp, zoom_sequence
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.config.models import Config
+from uni4d_fg.config.synthetic import SyntheticSceneConfig
+from uni4d_fg.errors import ConfigError
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel, Tracks
+from uni4d_fg.frontend.tracks.labels import label_tracks
+from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.results.evaluate.run import evaluate_run
+from uni4d_fg.results.export.run import export_run
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.labels_io import load_labels
+from uni4d_fg.results.residuals import reprojection_residuals
+from uni4d_fg.results.run import Run
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
+from uni4d_fg.slam.lens.tracks import unzoomed_tracks
+
+pytest.importorskip("open3d")
+
+FRAMES = 12
+
+
+def config(*changes: str) -> Config:
+    return load_config("default", ["output.clouds=false", "output.pictures=false", *changes])
+
+
+def scene(**more: object) -> Sequence:
+    small = {"num_frames": FRAMES, "grid_columns": 16, "grid_rows": 12, "query_interval": 4, "objects": "rigid"}
+    return make_synthetic_sequence(SyntheticSceneConfig(**(small | {"render_images": False} | more)))
+
+
+def labelled(sequence: Sequence) -> LabelledTracks:
+    settings = config()
+    assert sequence.tracks is not None
+    return label_tracks(sequence.tracks, sequence, settings.labels, settings.input)
+
+
+def calibrated(sequence: Sequence, *changes: str) -> LensCalibration:
+    return calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config(*changes))
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Sequence]]:
+    """A scene, and the same seen by a camera that zooms from 1 to 1.6."""
+    plain = scene()
+    out = {}
+    for name, sequence in (("plain", plain), ("zoomed", zoom_sequence(plain, ramp(FRAMES)))):
+        folder = tmp_path_factory.mktemp(name)
+        reconstruct(sequence, folder, config())
+        out[name] = folder, sequence
+    return out
+
+
+def test_every_frame_gets_its_focal_length(runs: dict[str, tuple[Path, Sequence]]) -> None:
+    result = load_reconstruction(RunFolder(runs["zoomed"][0]).reconstruction)
+    assert result.zoom is not None
+    np.testing.assert_allclose(result.frame_intrinsics[:, 0], 300.0 * ramp(FRAMES), rtol=0.03)
+    assert result.zoom.max() == 1.0
+    assert load_reconstruction(RunFolder(runs["plain"][0]).reconstruction).zoom is None
+
+
+def test_the_path_is_nearly_as_good_as_without_zoom(runs: dict[str, tuple[Path, Sequence]]) -> None:
+    errors = {name: evaluate_run(*run).to_dict()["trajectory"]["ate_m"] for name, run in runs.items()}
+    # What is left of zoom against motion along the view; taken for a camera that does not zoom it is 15 times as much.
+    assert errors["zoomed"] < 3.5 * errors["plain"]
+
+
+def test_the_summary_says_so(runs: dict[str, tuple[Path, Sequence]]) -> None:
+    folder, sequence = runs["zoomed"]
+    stage = json.loads(RunFolder(folder).summary.read_text())["stages"]["lens"]
+    assert any(fact.startswith("the camera zooms: fx from ") for fact in stage["facts"])
+    assert len(stage["zoom"]["focal_px"]) == FRAMES
+    again = reconstruct(sequence, folder, config(), resume=True)
+    assert all(again.stages[name]["resumed"] for name in ("lens", "bundle_adjustment", "nonrigid", "fusion"))
+
+
+def test_residuals_and_exports_have_a_camera_per_frame(runs: dict[str, tuple[Path, Sequence]], tmp_path: Path) -> None:
+    folder, sequence = runs["zoomed"]
+    result = load_reconstruction(RunFolder(folder).reconstruction)
+    residuals = reprojection_residuals(result, load_labels(RunFolder(folder).labels))
+    assert np.median(residuals.norm[~residuals.is_dynamic]) < 1.0
+    export_run(Run(folder, lambda: sequence), ["colmap", "nerfstudio"], tmp_path)
+    model = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
+    focal = [model.cameras[model.images[number + 1].camera_id].focal_length_x for number in range(FRAMES)]
+    np.testing.assert_allclose(focal, result.frame_intrinsics[:, 0], rtol=1e-12)
+    assert model.compute_mean_reprojection_error() < 1.2
+    frames = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())["frames"]
+    np.testing.assert_allclose([f["fl_x"] for f in frames], result.frame_intrinsics[:, 0])
+
+
+@pytest.mark.parametrize("more", [{"seed": 2}, {"path": "forward"}])
+def test_a_camera_that_does_not_zoom(more: dict[str, object]) -> None:
+    sequence = scene(**more)
+    found = calibrated(sequence)
+    assert found.zoom is not None
+    assert found.zoom.zoom is None
+    assert found.zoom.notes[0].startswith("a focal length per frame would lower the reprojection energy by ")
+    np.testing.assert_array_equal(found.intrinsics, sequence.intrinsics)
+
+
+def test_zoom_that_is_asked_for_or_ruled_out() -> None:
+    sequence = scene(seed=1)
+    forced = calibrated(sequence, "camera.zoom=on", "camera.model=pinhole")
+    assert forced.zoom is not None
+    assert forced.zoom.zoom is not None
+    np.testing.assert_allclose(forced.zoom.zoom, 1.0, atol=0.03)
+    assert calibrated(sequence, "camera.zoom=off").zoom is None
+    with pytest.raises(ConfigError, match="zoom 'on' goes with model 'auto' or 'pinhole', not with 'radial'"):
+        config("camera.zoom=on", "camera.model=radial")
+
+
+def test_unzoomed_tracks_are_those_of_one_focal_length() -> None:
+    sequence = scene()
+    ratio = ramp(FRAMES)
+    real, zoomed = labelled(sequence), labelled(zoom_sequence(sequence, ratio))
+    longest = sequence.intrinsics * [1.6, 1.6, 1.0, 1.0]
+    ideal = unzoomed_tracks(zoomed, longest, np.log(ratio / ratio.max()))
+    seen = zoomed.tracks.visible
+    expected = longest[2:] + 1.6 * (real.tracks.uv[: len(seen)] - longest[2:])
+    if len(real.label) == len(zoomed.label):
+        np.testing.assert_allclose(ideal.tracks.uv[seen], expected[seen], atol=1e-3)
+    weight = np.where(zoomed.weight > 0, (ratio / 1.6) ** 2, 0.0)
+    np.testing.assert_allclose(ideal.weight, weight * zoomed.weight, rtol=1e-5)
+
+
+def test_a_wall_seen_frontally_leaves_zoom_and_motion_open() -> None:
+    """A wall that grows: the camera zooms or comes nearer, and a cue without scale does not tell."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-1.2, 1.2, (150, 2)), np.full((150, 1), 4.0)], axis=1)
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 2, 3] = np.linspace(0.0, 0.8, 10)
+    K = np.array([300.0, 300.0, 159.5, 119.5])
+    x = world_to_camera(poses[None], points[:, None])
+    uv = (project(K, x) + rng.normal(0.0, 0.3, (150, 10, 2))).astype(np.float32)
+    visible = ((uv >= 0) & (uv <= [319, 239])).all(axis=2)
+    uv[~visible] = np.nan
+    depth = np.where(visible, x[..., 2] * np.exp(rng.normal(0.0, 0.15, (1, 10))), np.nan).astype(np.float32)
+    tracks = Tracks(uv, visible, np.zeros(150, np.int32))
+    given = LabelledTracks(
+        tracks,
+        np.full(150, int(TrackLabel.STATIC), np.int32),
+        np.zeros(150, np.int32),
+        visible.astype(np.float32),
+        depth,
+    )
+    found = calibrate_lens(given, (240, 320), K, config())
+    assert found.zoom is not None
+    assert any("zoom and motion along the view can hardly be told apart" in w for w in found.zoom.warnings)
+    plain = calibrated(scene(seed=1)).zoom
+    assert plain is not None
+    assert not plain.warnings

@@ -1,0 +1,122 @@
+"""What to distrust of cameras from motion alone, and which quantities the motion leaves open."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.structure.motion import Structure
+from uni4d_fg.cues.structure.rivals import rotation_difference
+from uni4d_fg.frontend.sequence.problems import some_of
+
+_OPEN_FOCAL = 0.06
+"""An interval of focal lengths that reaches farther than this part of the focal length is warned of."""
+_RIVAL_DEGREES = 5.0
+"""Cameras of another start that are turned by more than this against the result are warned of, ..."""
+_RIVAL_DEGREES_PER_FRAME = 0.5
+"""... and those whose turns from frame to frame differ by more than this."""
+_MUCH_UNEXPLAINED = 0.6
+"""More than this part of what was held out is warned of."""
+_FEW_FRAMES = 0.5
+"""Fewer frames with a pose than this part of the video are warned of."""
+
+
+def start_doubts(structure: Structure, image_size: tuple[int, int], config: GeometricDepthConfig) -> list[str]:
+    """Return one sentence for everything that a reader should know of the cameras.
+
+    Args:
+        structure: Cameras and what is known of them.
+        image_size: (height, width), px.
+        config: Its field ``usual_focal``.
+    """
+    warnings = []
+    bridged = np.flatnonzero(~structure.registered).tolist()
+    if bridged:
+        severe = len(bridged) > (1.0 - _FEW_FRAMES) * len(structure.registered)
+        warnings.append(
+            f"{len(bridged)} frame(s) see too few points of the static scene, and their cameras are only interpolated"
+            f"{' (most of the video: do not trust this result)' if severe else ''}: {some_of(bridged)}"
+        )
+    warnings += _open_focal(structure)
+    warnings += _doubtful_start(structure)
+    focal = float(np.mean(structure.intrinsics[:2]))
+    side = float(max(image_size))
+    usual = config.usual_focal
+    if not usual[0] * side <= focal <= usual[1] * side:
+        warnings.append(
+            f"the focal length found ({focal:.0f} px, {focal / side:.2f} of the longer image side) is unusual: moving "
+            "things without a mask, or motion from which it cannot be told; give K.npy if it is known"
+        )
+    return warnings
+
+
+def doubts_of_masks(before: FloatArray, after: FloatArray) -> list[str]:
+    """Return a sentence if masks from motion changed the cameras much that they were made with.
+
+    Args:
+        before: (T, 4, 4) cameras from all tracks.
+        after: (T, 4, 4) cameras from the tracks outside the masks.
+    """
+    degrees, per_frame = rotation_difference(before, after, np.arange(len(before)))
+    if degrees <= _RIVAL_DEGREES and per_frame <= _RIVAL_DEGREES_PER_FRAME:
+        return []
+    return [
+        f"the cameras turned by {degrees:.0f} degrees ({per_frame:.2f} per frame) when what seems to move was masked: "
+        "what was taken for the static scene may be a moving thing; look at the masks, or give some"
+    ]
+
+
+def _open_focal(structure: Structure) -> list[str]:
+    focal = float(np.mean(structure.intrinsics[:2]))
+    below, above = structure.focal.relative(focal)
+    if max(-below, above) <= _OPEN_FOCAL:
+        return []
+    low = "any shorter one" if structure.focal.low_is_open else f"{structure.focal.low:.0f}"
+    high = "any longer one" if structure.focal.high_is_open else f"{structure.focal.high:.0f} px"
+    return [
+        f"this video leaves the focal length open: {focal:.0f} px was found, but from {low} to {high} explain the "
+        f"tracks as well; depth, and motion along the viewing direction, stretch with it ({100 * below:+.0f} to "
+        f"{100 * above:+.0f} %); give K.npy if it is known"
+    ]
+
+
+def _doubtful_start(structure: Structure) -> list[str]:
+    warnings = []
+    if structure.unexplained > _MUCH_UNEXPLAINED:
+        warnings.append(
+            f"the cameras found explain only {100 * (1.0 - structure.unexplained):.0f} % of the tracks that were held "
+            "out to judge them: much may move, or the tracks are bad; look before you trust them, or give masks"
+        )
+    against = [
+        rival
+        for rival in structure.rivals
+        if rival.degrees > _RIVAL_DEGREES or rival.degrees_per_frame > _RIVAL_DEGREES_PER_FRAME
+    ]
+    if against:
+        worst = max(against, key=lambda rival: rival.degrees)
+        here, there = (100 * (1.0 - part) for part in (structure.unexplained, worst.unexplained))
+        warnings.append(
+            f"the cameras are ambiguous: a start from frames {worst.first} and {worst.second} explains the tracks "
+            f"nearly as well ({there:.0f} against {here:.0f} %) with cameras turned by {worst.degrees:.0f} degrees "
+            f"({worst.degrees_per_frame:.2f} per frame); give masks of what moves, or K.npy"
+        )
+    return warnings
+
+
+def start_summary(structure: Structure) -> dict[str, Any]:
+    """Return what is open, as plain data for the summary of a run."""
+    focal = float(np.mean(structure.intrinsics[:2]))
+    below, above = structure.focal.relative(focal)
+    return {
+        "focal_px": focal,
+        "focal_interval_px": [structure.focal.low, structure.focal.high],
+        "focal_is_open": [structure.focal.low_is_open, structure.focal.high_is_open],
+        "stretch_along_view": [1.0 + below, 1.0 + above],
+        "unexplained": structure.unexplained,
+        "registered": float(np.mean(structure.registered)),
+        "starts": [asdict(rival) for rival in structure.rivals],
+    }

@@ -1,0 +1,83 @@
+"""Which tracks disagree with what most of the picture does, before any camera is known.
+
+Between frames a few steps apart, the epipolar geometry that most of the picture agrees on is found robustly. Every part
+of the picture has the same say, whatever its texture: a person in a patterned shirt close to the camera may hold more
+tracks than the room. No focal length is needed.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.structure.first_pair import CommonTracks
+from uni4d_fg.cues.structure.selection import picture_cells
+from uni4d_fg.slam.stages.observations import Observations
+
+_CONFIDENCE = 0.999
+_MIN_PAIRS = 8
+"""Tracks that two frames must share: one more than a fundamental matrix takes."""
+_PAIRS_PER_STEP = 40
+"""Pairs of frames at most that each step looks at, spread over the video."""
+
+
+def epipolar_outliers(
+    observations: Observations, num_frames: int, image_size: tuple[int, int], config: GeometricDepthConfig
+) -> BoolArray:
+    """Return (M,) which tracks disagree with the majority in most of the pairs of frames that see them.
+
+    Args:
+        observations: N observations of M tracks.
+        num_frames: T.
+        image_size: (height, width), px.
+        config: Its fields ``epipolar_...``.
+    """
+    common = CommonTracks(observations, num_frames)
+    tracks, row = observations.rows()
+    cell = picture_cells(observations.uv, image_size)
+    agreed, tested = np.zeros(len(tracks)), np.zeros(len(tracks))
+    for step in sorted({min(step, num_frames - 1) for step in config.epipolar_steps}):
+        stride = max(1, step // 2, (num_frames - step) // _PAIRS_PER_STEP)
+        for first in range(0, num_frames - step, stride):
+            a, b = common.between(first, first + step)
+            distance = _distances(observations.uv[a], observations.uv[b], cell[a], config)
+            if distance is not None:
+                tested[row[a]] += 1
+                agreed[row[a]] += distance <= config.epipolar_px
+    return np.asarray((tested > 0) & (agreed < 0.5 * tested))
+
+
+def _distances(
+    first: FloatArray, second: FloatArray, cell: IntArray, config: GeometricDepthConfig
+) -> FloatArray | None:
+    """Return the distance (N,) px of pixel pairs from the epipolar geometry that most cells agree on, or None."""
+    # No more from a part with much texture than most parts have.
+    usual = int(np.percentile(np.unique(cell, return_counts=True)[1], 25)) if len(cell) else 1
+    used = _balanced(cell, max(1, min(config.epipolar_per_cell, usual)))
+    if len(used) < _MIN_PAIRS:
+        return None
+    matrix, _ = cv2.findFundamentalMat(
+        first[used], second[used], cv2.USAC_MAGSAC, config.epipolar_px, _CONFIDENCE, config.two_view_trials
+    )
+    if matrix is None or matrix.shape != (3, 3):
+        return None
+    a, b = (np.concatenate([uv, np.ones((len(uv), 1))], axis=1) for uv in (first, second))
+    line, back = a @ matrix.T, b @ matrix
+    # Sampson's distance.
+    slope = np.sqrt(line[:, 0] ** 2 + line[:, 1] ** 2 + back[:, 0] ** 2 + back[:, 1] ** 2)
+    result: FloatArray = np.abs(np.sum(b * line, axis=1)) / np.maximum(slope, 1e-12)
+    return result
+
+
+def _balanced(cell: IntArray, count: int) -> IntArray:
+    """Return indices of at most ``count`` entries of each cell, evenly spread over it, ascending."""
+    order = np.argsort(cell, kind="stable")
+    _, start, size = np.unique(cell[order], return_index=True, return_counts=True)
+    rank = np.arange(len(cell)) - np.repeat(start, size)
+    size = np.repeat(size, size)
+    # Entry k of n is taken when floor(k m / n) changes.
+    share = np.minimum(count / size, 1.0)
+    taken = np.floor((rank + 1) * share + 1e-9) > np.floor(rank * share + 1e-9)
+    return np.sort(order[taken])

@@ -1,0 +1,178 @@
+"""Several beginnings that compete: each is grown on some frames and tracks, and judged by what it explains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.structure.first_pair import FramePair, rank_pairs
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.growth import grow
+from uni4d_fg.cues.structure.judging import held_out, unexplained
+from uni4d_fg.cues.structure.selection import spread_tracks
+from uni4d_fg.errors import Cancelled, SolverError
+from uni4d_fg.progress import SilentReporter
+from uni4d_fg.slam.stages.observations import Observations
+
+_TRIAL_GROWTH = 1.7
+"""Bundle adjustment of a trial is repeated whenever its frames have grown by this factor."""
+_TRIAL_ITERATIONS = 15
+_UNUSUAL = 0.2
+"""What an unusual focal length adds to the unexplained part."""
+_MUCH = 0.25
+"""From this part of the tracks on, those that disagree with the majority may be the world."""
+_OVERLAP = 0.5
+"""Pairs that overlap by more than this part of their union are one start."""
+
+
+Part = Literal["majority", "minority", "all"]
+"""Tracks that agree with the epipolar geometry of most of the picture, those that do not, or both."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A start that was tried."""
+
+    pair: FramePair
+    focal_factor: float
+    """The starting focal length as a part of the given one."""
+    tracks: Part
+    """Which tracks took part."""
+    scene: GrowingScene
+    """What it grew to, on few frames and tracks."""
+    frames: IntArray
+    """(t,) frames of the trial."""
+    unexplained: float
+    """Part of the held-out observations that it leaves unexplained, see :func:`unexplained`."""
+    is_usual: bool
+    """Whether its focal length is one that cameras have."""
+
+    @property
+    def cost(self) -> float:
+        """What it is ranked by."""
+        return self.unexplained + (0.0 if self.is_usual else _UNUSUAL)
+
+
+@dataclass
+class Competition:
+    """What all the trials share."""
+
+    observations: Observations
+    outlier: BoolArray
+    """(N,) observations of tracks that disagree with the majority."""
+    num_frames: int
+    image_size: tuple[int, int]
+    intrinsics: FloatArray
+    config: Config
+    free_focal: bool
+    should_stop: Callable[[], bool]
+
+    def run(self) -> list[Hypothesis]:
+        """Try starts; return those that give a scene, the best first.
+
+        Raises:
+            Cancelled: If asked to stop.
+        """
+        settings = self.config.geometric_depth
+        chosen = distinct(self.pairs("majority"), settings.tried_pairs)
+        starts: list[tuple[FramePair, Part]] = [(pair, "majority") for pair in chosen]
+        if self.outlier.any():
+            starts += [(pair, "all") for pair in chosen[:1]]
+        if self.outlier.mean() >= _MUCH:
+            starts += [(pair, "minority") for pair in self.pairs("minority")[:1]]
+        found = [hypothesis for pair, part in starts if (hypothesis := self.trial(pair, 1.0, part)) is not None]
+        if found and self.free_focal:
+            best = min(found, key=lambda hypothesis: hypothesis.cost)
+            factors = [factor for factor in settings.focal_starts if factor != 1.0]
+            tried = [self.trial(best.pair, factor, best.tracks) for factor in factors]
+            found += [hypothesis for hypothesis in tried if hypothesis is not None]
+        return sorted(found, key=lambda hypothesis: hypothesis.cost)
+
+    def chosen(self, part: Part) -> BoolArray:
+        """Return (N,) which observations belong to a part of the tracks."""
+        if part == "all":
+            return np.ones(len(self.outlier), dtype=bool)
+        return self.outlier if part == "minority" else ~self.outlier
+
+    def pairs(self, part: Part) -> list[FramePair]:
+        """Return the pairs of frames between which a part of the tracks has parallax, the best first."""
+        settings = self.config.geometric_depth
+        seen = self.observations.select(self.chosen(part))
+        if len(seen) == 0:
+            return []
+        ranked = rank_pairs(seen, self.num_frames, self.intrinsics, settings, known_focal=not self.free_focal)
+        return [pair for pair in ranked if pair.parallax_px >= settings.min_parallax_px]
+
+    def trial(self, pair: FramePair, factor: float, part: Part) -> Hypothesis | None:
+        """Start from a pair, add frames around it, and judge; None if the pair gives no points."""
+        if self.should_stop():
+            raise Cancelled("structure from motion stopped")
+        settings = self.config.geometric_depth
+        frames = trial_frames(pair, self.num_frames, settings.trial_step, settings.trial_frames)
+        inside = np.isin(self.observations.frame, frames)
+        seen = self.observations.select(inside)
+        picked = spread_tracks(seen, self.image_size, settings.trial_tracks)
+        judged = seen.select(picked)
+        kept_out = held_out(judged, settings.held_out_every)
+        used = judged.select(~kept_out & self.chosen(part)[inside][picked])
+        if len(used) == 0:
+            return None
+        scene = GrowingScene.empty(
+            used.with_min_observations(2),
+            self.num_frames,
+            self.intrinsics * np.array([factor, factor, 1.0, 1.0]),
+            _quick(self.config),
+            free_focal=self.free_focal,
+            prior_intrinsics=self.intrinsics,
+            should_stop=self.should_stop,
+        )
+        try:
+            if scene.start(pair) < settings.min_pose_points:
+                return None
+            grow(scene, SilentReporter(), growth=_TRIAL_GROWTH)
+        except SolverError:
+            return None
+        focal = float(np.mean(scene.intrinsics[:2])) / max(self.image_size)
+        is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
+        left = unexplained(scene, judged.select(kept_out), self.image_size)
+        return Hypothesis(pair, factor, part, scene, frames, left, is_usual)
+
+
+def trial_frames(pair: FramePair, num_frames: int, steps: int, count: int) -> IntArray:
+    """Return up to ``count`` frames around a pair, both of its frames among them, (t,) ascending."""
+    between = np.unique(np.linspace(pair.first, pair.second, steps + 1).round().astype(np.int64))
+    step = max(1, round((pair.second - pair.first) / steps))
+    before = np.arange(pair.first - step, -1, -step)
+    after = np.arange(pair.second + step, num_frames, step)
+    room = max(0, count - len(between))
+    # As many on either side as there are, the nearest first.
+    left = min(len(before), max(room // 2, room - len(after)))
+    return np.sort(np.concatenate([before[:left], between, after[: room - left]]))
+
+
+def distinct(pairs: list[FramePair], count: int) -> list[FramePair]:
+    """Return the best ``count`` pairs that do not overlap much; then others, where there are too few."""
+    chosen: list[FramePair] = []
+    for pair in pairs:
+        if len(chosen) < count and all(_overlap(pair, other) <= _OVERLAP for other in chosen):
+            chosen.append(pair)
+    rest = [pair for pair in pairs if pair not in chosen]
+    return chosen + rest[: count - len(chosen)]
+
+
+def _overlap(a: FramePair, b: FramePair) -> float:
+    shared = min(a.second, b.second) - max(a.first, b.first)
+    return max(shared, 0) / (max(a.second, b.second) - min(a.first, b.first))
+
+
+def _quick(config: Config) -> Config:
+    solver = config.bundle_adjustment.solver
+    solver = solver.model_copy(update={"max_iterations": min(solver.max_iterations, _TRIAL_ITERATIONS)})
+    return config.model_copy(
+        update={"bundle_adjustment": config.bundle_adjustment.model_copy(update={"solver": solver})}
+    )

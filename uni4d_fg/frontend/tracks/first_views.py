@@ -1,0 +1,111 @@
+"""Following points by their first views: a step of Lucas-Kanade, then registration against the view they started in.
+
+A chain of steps adds up the errors of each. Here a step only says where to look: the point is where its first view is
+found (:mod:`uni4d_fg.frontend.tracks.registration`), and a view that is found needs no check backwards. A point whose
+first view is not found (another scale, a highlight, a neighbor in front) is checked backwards and takes a new first
+view where the step led it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
+from uni4d_fg.config.cues import TrackingConfig
+from uni4d_fg.frontend.tracks.optical_flow import comes_back, steps_ahead
+from uni4d_fg.frontend.tracks.registration import cut_templates, is_fast, register
+
+_LARGEST_STRETCH = 2.0
+"""A first view that is stretched or shrunk by more is no longer a fair sample of what is seen."""
+_IDENTITY = np.array([1.0, 0.0, 0.0, 1.0])
+
+
+def refines(config: TrackingConfig) -> bool:
+    """Return whether points are followed by their first views."""
+    return config.refine == "on" or (config.refine == "auto" and is_fast())
+
+
+@dataclass
+class FirstViews:
+    """The first views of the N points that are followed, and how they are warped at present."""
+
+    config: TrackingConfig
+    templates: Float32Array = field(init=False)
+    """(M, P + 2, P + 2) gray levels; some rows are of points that were lost, or free."""
+    row: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(N,) of each point among the templates."""
+    affine: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    """(N, 4) by rows, from the first view to the present one."""
+    _used: int = 0
+
+    def __post_init__(self) -> None:
+        side = 2 * (self.config.patch_px // 2) + 3
+        self.templates = np.zeros((0, side, side), np.float32)
+
+    def add(self, image: ImageArray, points: Float32Array) -> None:
+        """Append points (N, 2) px that start in an image (H, W) uint8."""
+        end = self._used + len(points)
+        if end > len(self.templates):
+            # Room for as many again: copying what is there is then rare.
+            alive = self.templates[self.row]
+            self.templates = np.empty((2 * (len(alive) + len(points)), *alive.shape[1:]), np.float32)
+            self.templates[: len(alive)] = alive
+            self.row, self._used = np.arange(len(alive)), len(alive)
+            end = self._used + len(points)
+        self.templates[self._used : end] = cut_templates(image, points, self.config.patch_px)
+        self.row = np.concatenate((self.row, np.arange(self._used, end)))
+        self.affine = np.concatenate((self.affine, np.tile(_IDENTITY, (len(points), 1))))
+        self._used = end
+
+    def select(self, keep: BoolArray | IntArray) -> None:
+        """Forget all points but those picked by a mask or by indices."""
+        self.row, self.affine = self.row[keep], self.affine[keep]
+
+    def follow(self, source: ImageArray, target: ImageArray, points: Float32Array) -> tuple[BoolArray, Float32Array]:
+        """Move the N points from one gray image to the next, to where their first views are found.
+
+        Args:
+            source: (H, W) uint8, the image in which the points are known.
+            target: (H, W) uint8.
+            points: (N, 2) px in ``source``.
+
+        Returns:
+            kept: (N,) True for the M points that passed; the views of the others are forgotten.
+            moved: (M, 2) their pixels in ``target``.
+        """
+        kept = np.zeros(len(points), np.bool_)
+        if len(points) == 0:
+            return kept, points
+        moved, ahead = steps_ahead(source, target, points, self.config)
+        candidate = np.flatnonzero(ahead)
+        moved = moved[candidate]
+        self.select(candidate)
+        warp, correlation = register(self.templates, self.row, target, np.concatenate((moved, self.affine), axis=1))
+        found = _is_found(warp, correlation, moved, target, self.config)
+        lost = np.flatnonzero(~found)
+        back = lost[comes_back(source, target, points[candidate[lost]], moved[lost], self.config)]
+        moved[found], self.affine[found] = warp[found, :2], warp[found, 2:]
+        self.templates[self.row[back]] = cut_templates(target, moved[back], self.config.patch_px)
+        self.affine[back] = _IDENTITY
+        found[back] = True
+        kept[candidate[found]] = True
+        self.select(found)
+        return kept, moved[found]
+
+
+def _is_found(
+    warp: FloatArray, correlation: FloatArray, moved: Float32Array, image: ImageArray, config: TrackingConfig
+) -> BoolArray:
+    """Return (N,) where a first view was found near enough, and looks the same."""
+    near = np.linalg.norm(warp[:, :2] - moved, axis=1) <= config.max_refinement_px
+    a, b, c, d = warp[:, 2:].T
+    # The singular values of a 2 x 2 matrix, from the sum of their squares and their product.
+    squares, product = 0.5 * (a * a + b * b + c * c + d * d), a * d - b * c
+    root = np.sqrt(np.maximum(squares**2 - product**2, 0.0))
+    moderate = (product > 0) & (squares + root <= _LARGEST_STRETCH**2) & (squares - root >= _LARGEST_STRETCH**-2)
+    limit = np.array(image.shape[::-1]) - 1 - config.border_px
+    inside = (warp[:, :2] >= config.border_px).all(axis=1) & (warp[:, :2] <= limit).all(axis=1)
+    found: BoolArray = near & moderate & inside & (correlation >= config.min_patch_correlation)
+    return found

@@ -1,0 +1,1 @@
+"""Experiments over whole datasets: independent runs with results on disk, scores by named protocols, tables."""

@@ -1,0 +1,137 @@
+"""Rows of the tables from a YAML file: configurations by name, and all combinations of what varies.
+
+base: {preset: default, set: [output.pictures=false]}
+rows:
+  default: {}
+  without ARAP: {set: [nonrigid.arap_weight=0]}
+  known intrinsics: {intrinsics: known}
+grid:
+  solver: [lm, adam]          # fields of the configuration, or preset, intrinsics, depth, masks, tracks, poses
+  preset: [default, paper]
+"""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.errors import ConfigError
+from uni4d_fg.pipeline.benchmark.task import Configuration, Masks, check_names
+from uni4d_fg.reading import read_text
+
+PAPER: dict[str, dict[str, Any]] = {
+    "all": {},
+    "from cameras at rest (stage 2 only)": {"poses": "identity"},
+    "without E_NR": {"set": ["nonrigid.reprojection=false"]},
+    "without ARAP": {"set": ["nonrigid.arap_weight=0"]},
+    "without smoothness": {"set": ["nonrigid.smoothness_weight=0"]},
+    "known intrinsics": {"intrinsics": "known"},
+    "built-in tracker": {"tracks": "built_in"},
+    "masks from motion": {"masks": "motion"},
+    "no masks": {"masks": "none"},
+    "depth from motion": {"depth": "motion"},
+}
+"""The rows of ``uni4d-fg ablate`` without a file: the paper's ablations as far as no other network is needed."""
+
+
+class _Way(BaseModel):
+    """What a row may say."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    preset: str = "default"
+    set: tuple[str, ...] = ()
+    intrinsics: Literal["unknown", "known"] = "unknown"
+    depth: Literal["cue", "motion"] = "cue"
+    masks: Masks = "cue"
+    tracks: Literal["cue", "built_in"] = "cue"
+    poses: Literal["estimate", "identity"] = "estimate"
+
+    def named(self, name: str) -> Configuration:
+        return Configuration(
+            name, self.preset, self.set, self.intrinsics, self.depth, self.masks, self.tracks, self.poses
+        )
+
+
+class _File(BaseModel):
+    """A whole file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    base: dict[str, Any] = {}
+    rows: dict[str, dict[str, Any] | None] = {}
+    grid: dict[str, list[Any]] = {}
+
+
+def read_grid(path: Path) -> list[Configuration]:
+    """Read configurations, and make sure that each is a valid one.
+
+    Raises:
+        InputError: If the file cannot be read.
+        ConfigError: If it is not of that form, a field is unknown, a value not allowed, or a name used twice.
+    """
+    try:
+        found = _File.model_validate(yaml.safe_load(read_text(path)) or {})
+    except (yaml.YAMLError, ValidationError) as error:
+        raise ConfigError(f"{path}: is not a list of configurations ({_said(error)})") from error
+    if not found.rows and not found.grid:
+        raise ConfigError(f"{path}: has neither rows nor a grid; name at least one configuration")
+    named = [(name, row or {}) for name, row in found.rows.items()]
+    for values in itertools.product(*found.grid.values()):
+        if values:
+            named.append(_combination(dict(zip(found.grid, values, strict=True))))
+    return configurations(named, found.base, str(path))
+
+
+def configurations(named: list[tuple[str, dict[str, Any]]], base: dict[str, Any], where: str) -> list[Configuration]:
+    """Return checked configurations.
+
+    Args:
+        named: Name and what it changes of ``base``.
+        base: What all have in common.
+        where: File or option, for messages.
+
+    Raises:
+        ConfigError: As :func:`read_grid`.
+    """
+    made = []
+    for name, row in named:
+        both = {**base, **row, "set": (*base.get("set", ()), *row.get("set", ()))}
+        try:
+            chosen = _Way.model_validate(both).named(_folder_name(name))
+        except ValidationError as error:
+            raise ConfigError(f"{where}: {name}: {_said(error)}") from error
+        load_config(chosen.preset, chosen.changes)
+        made.append(chosen)
+    check_names(made)
+    return made
+
+
+def _combination(values: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return name and changes of a point of a grid; what is no key of a row is a field of the configuration."""
+    row: dict[str, Any] = {"set": []}
+    for key, value in values.items():
+        if key in _Way.model_fields:
+            row[key] = value
+        else:
+            row["set"].append(f"{key}={_plain(value)}")
+    return ", ".join(f"{key.rpartition('.')[2]} {_plain(value)}" for key, value in values.items()), row
+
+
+def _plain(value: Any) -> str:
+    """Return a value as YAML has it."""
+    return str(value) if isinstance(value, str) else str(yaml.safe_dump(value, default_flow_style=True)).split("\n")[0]
+
+
+def _folder_name(name: str) -> str:
+    return name.replace("/", "-").strip()
+
+
+def _said(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(map(str, first['loc'])) or 'the file'}: {first['msg']}"
+    return " ".join(str(error).split())

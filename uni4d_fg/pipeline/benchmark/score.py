@@ -1,0 +1,140 @@
+"""Every score of an estimate that the truth of its video allows, by the protocols that are asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from uni4d_fg.frontend.sequence.frames import no_masks
+from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.geometry.camera import world_to_camera
+from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.pipeline.store import StageStore
+from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.evaluate.protocols.consistency import score_consistency
+from uni4d_fg.results.evaluate.protocols.depth import DEPTH_PROTOCOLS, score_depth
+from uni4d_fg.results.evaluate.protocols.pose import POSE_PROTOCOLS, score_poses
+from uni4d_fg.results.evaluate.protocols.tracks3d import score_tracks
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a method says about a video; None where it says nothing."""
+
+    world_T_cam: FloatArray | None = None
+    """(T, 4, 4); NaN where there is none."""
+    depths: FrameSource[Float32Array] | None = None
+    """T maps of any size."""
+    intrinsics: FloatArray | None = None
+    """(4,) px, of images of the size of ``depths``."""
+    lens: Lens = PINHOLE
+    tracks: tuple[FloatArray, BoolArray] | None = None
+    """(K, T, 3) of the video's own tracks, in the camera of their frame, NaN where there is none; and (K, T) seen."""
+
+
+def score_estimate(
+    video: Video,
+    estimate: Estimate,
+    dataset: str,
+    pose_protocols: tuple[str, ...],
+    depth_protocols: tuple[str, ...],
+    masks: FrameSource[Int32Array] | None = None,
+) -> dict[str, Any]:
+    """Score an estimate.
+
+    Args:
+        video: With its truth.
+        estimate: Of the same frames.
+        dataset: Name of the dataset, which decides on ranges.
+        pose_protocols: Names.
+        depth_protocols: Names.
+        masks: T label maps of the size of the estimate's depth, for self-consistency.
+
+    Returns:
+        By kind: 'poses' and 'depth' by protocol, 'consistency', 'tracks'; a kind that cannot be scored is not there.
+        'regions' says whose masks parted the depth.
+    """
+    truth = video.ground_truth
+    found: dict[str, Any] = {}
+    if estimate.world_T_cam is not None and truth.world_T_cam is not None:
+        scores = {
+            name: score_poses(POSE_PROTOCOLS[name], estimate.world_T_cam, truth.world_T_cam) for name in pose_protocols
+        }
+        found["poses"] = {name: score.to_dict() for name, score in scores.items() if score is not None}
+    if estimate.depths is not None and truth.depths is not None:
+        regions = truth.masks if truth.masks is not None else video.masks
+        found["depth"] = {
+            name: score_depth(DEPTH_PROTOCOLS[name], dataset, estimate.depths, truth.depths, regions).to_dict()
+            for name in depth_protocols
+        }
+        if regions is not None:
+            found["regions"] = "true masks" if truth.masks is not None else "masks of the cues"
+    if estimate.depths is not None and estimate.world_T_cam is not None and estimate.intrinsics is not None:
+        label = masks if masks is not None else no_masks(estimate.depths[0].shape, len(estimate.depths))
+        if np.isfinite(estimate.world_T_cam).all():
+            own = score_consistency(
+                estimate.depths, label, estimate.world_T_cam, estimate.intrinsics, lens=estimate.lens
+            )
+            if own is not None:
+                found["consistency"] = own.to_dict()
+    if estimate.tracks is not None:
+        tracked = _score_tracks(video, *estimate.tracks)
+        if tracked is not None:
+            found["tracks"] = tracked
+    return found
+
+
+def estimate_of_run(folder: Path, sequence: Sequence) -> Estimate:
+    """Return what a finished run says. Raises InputError if it cannot be read."""
+    files = RunFolder(folder)
+    found = load_reconstruction(files.reconstruction)
+    depths = read_depth(files.depth) if files.depth.exists() else None
+    return Estimate(found.world_T_cam, depths, found.intrinsics, found.lens, _tracks_of(found, sequence))
+
+
+def poses_of_stages(folder: Path) -> dict[str, FloatArray]:
+    """Return the camera poses (T, 4, 4) after each stage of a run that left some, in order."""
+    store = StageStore(folder / "stages")
+    records = {stage: store.load(stage) for stage in ("camera_init", "bundle_adjustment", "joint")}
+    return {
+        stage: record.arrays["world_T_cam"]
+        for stage, record in records.items()
+        if record is not None and "world_T_cam" in record.arrays
+    }
+
+
+def _tracks_of(found: Reconstruction, sequence: Sequence) -> tuple[FloatArray, BoolArray] | None:
+    """Return the points of the sequence's own tracks in the cameras, and where the run takes them to be seen."""
+    tracks = sequence.tracks
+    used = [rows for rows in (found.landmark_track, found.dynamic_track) if len(rows)]
+    if tracks is None or not used or max(int(rows.max()) for rows in used) >= tracks.num_tracks:
+        return None
+    world: FloatArray = np.full((*tracks.visible.shape, 3), np.nan)
+    seen: BoolArray = np.zeros(tracks.visible.shape, dtype=bool)
+    world[found.landmark_track] = found.landmarks[:, None]
+    seen[found.landmark_track] = tracks.visible[found.landmark_track]
+    world[found.dynamic_track] = found.dynamic_points
+    seen[found.dynamic_track] = found.dynamic_observed
+    points = np.stack([world_to_camera(pose, world[:, t]) for t, pose in enumerate(found.world_T_cam)], axis=1)
+    return points, seen & np.isfinite(points).all(axis=2)
+
+
+def _score_tracks(video: Video, points: FloatArray, seen: BoolArray) -> dict[str, Any] | None:
+    truth, tracks = video.ground_truth, video.tracks
+    if truth.track_points is None or truth.world_T_cam is None or truth.intrinsics is None or tracks is None:
+        return None
+    if truth.track_points.shape != points.shape:
+        return None
+    local = np.stack(
+        [world_to_camera(pose, truth.track_points[:, t]) for t, pose in enumerate(truth.world_T_cam)], axis=1
+    )
+    known = np.isfinite(local).all(axis=2)
+    score = score_tracks(points, seen, local, tracks.visible & known, truth.intrinsics)
+    return None if score is None else score.to_dict()

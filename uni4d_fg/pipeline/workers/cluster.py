@@ -1,0 +1,110 @@
+"""Opening worker processes: of this machine, or of a cluster that somebody started."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from uni4d_fg.errors import ConfigError, InputError
+from uni4d_fg.optional import import_distributed
+from uni4d_fg.pipeline.workers.options import WorkerOptions
+
+_CONNECT_SECONDS = 30.0
+_START_SECONDS = 300.0
+_PRELOAD = "uni4d_fg.pipeline.workers.guarded"
+
+
+@contextmanager
+def open_workers(options: WorkerOptions, count: int, folder: Path) -> Iterator[Any]:
+    """Give a ``distributed.Client`` with workers; those that were started here end with the context.
+
+    Args:
+        options: Where they are.
+        count: Processes, if they are of this machine.
+        folder: Where tasks write; workers of a cluster must see it under the same path.
+
+    Raises:
+        MissingDependencyError: If ``distributed`` is not installed.
+        InputError: If the scheduler does not answer, or its workers do not see the folder.
+        ConfigError: If its workers have several threads, or another version of this package.
+    """
+    distributed = import_distributed()
+    with ExitStack() as stack:
+        _quiet(stack)
+        if options.scheduler is not None:
+            client = stack.enter_context(_connect(distributed, options.scheduler))
+            _check_workers(client, options.scheduler, folder)
+        else:
+            client = stack.enter_context(_local(distributed, options, count))
+        yield client
+
+
+@contextmanager
+def _local(distributed: Any, options: WorkerOptions, count: int) -> Iterator[Any]:
+    import dask
+
+    threads = {f"distributed.nanny.pre-spawn-environ.{name}": str(options.threads) for name in _THREAD_VARIABLES}
+    # Retries are counted by who gives the tasks out: the scheduler says at once that a worker died.
+    changed = {"distributed.scheduler.allowed-failures": 0, **threads}
+    with (
+        dask.config.set(changed),
+        distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address="127.0.0.1:0",
+            host="127.0.0.1", preload=[_PRELOAD], silence_logs=logging.CRITICAL,
+        ) as cluster,
+        distributed.Client(cluster, timeout=_START_SECONDS) as client,
+    ):  # fmt: skip
+        client.wait_for_workers(1, timeout=_START_SECONDS)
+        yield client
+
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def _connect(distributed: Any, address: str) -> Any:
+    try:
+        return distributed.Client(address, timeout=_CONNECT_SECONDS)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError(
+            f"no Dask scheduler answers at {address} ({' '.join(str(error).split())}); start one with `dask scheduler`"
+        ) from error
+
+
+def _check_workers(client: Any, address: str, folder: Path) -> None:
+    """Look at the workers that are there; a cluster may add others later."""
+    for worker, threads in client.nthreads().items():
+        if threads != 1:
+            raise ConfigError(f"{worker}: has {threads} threads; start the workers with `--nthreads 1`")
+    try:
+        told = client.run(_seen_by_worker, str(folder))
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{address}: a worker lacks the package {error.name!r}; install it there") from error
+    here = _version()
+    for worker, (there, is_there) in told.items():
+        if there != here:
+            raise ConfigError(f"{worker}: has uni4d-fg {there}, here is {here}; install the same")
+        if not is_there:
+            raise InputError(f"{worker}: sees no folder {folder}; choose one that all machines share")
+
+
+def _seen_by_worker(folder: str) -> tuple[str, bool]:
+    return _version(), Path(folder).is_dir()
+
+
+def _version() -> str:
+    try:
+        return version("uni4d-fg")
+    except PackageNotFoundError:  # a source tree that is not installed
+        return "from source"
+
+
+def _quiet(stack: ExitStack) -> None:
+    """Keep Dask's logs of lost workers off the terminal: what became of a task, its result says."""
+    for name in ("distributed", "distributed.nanny", "distributed.scheduler", "distributed.core"):
+        logger = logging.getLogger(name)
+        stack.callback(logger.setLevel, logger.level)
+        logger.setLevel(logging.CRITICAL)

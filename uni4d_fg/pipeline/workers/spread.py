@@ -1,0 +1,126 @@
+"""Giving tasks to workers one by one, and again where a worker died."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.optional import import_distributed
+from uni4d_fg.pipeline.workers.guarded import guarded
+from uni4d_fg.pipeline.workers.options import WorkerOptions
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
+
+_POLL_SECONDS = 0.5
+_UNSTARTED = 20
+"""How often a task may be given to a worker that dies before it begins."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A task without a result."""
+
+    why: str
+
+
+def spread(
+    client: Any,
+    function: Callable[[ItemT], ResultT],
+    items: Sequence[ItemT],
+    options: WorkerOptions,
+    traces: Sequence[Path],
+    should_stop: Callable[[], bool] | None = None,
+) -> Iterator[tuple[int, ResultT | Lost]]:
+    """Apply a function to independent items on the workers of a client.
+
+    A worker gets a task when it has none, and that task is for it alone: one that dies takes nothing else with it, and
+    what is tried again is counted here, whatever the scheduler is told.
+
+    Args:
+        client: Of :func:`~uni4d_fg.pipeline.workers.cluster.open_workers`.
+        function: Of a module that the workers can import.
+        items: Its arguments.
+        options: Threads, time limit and retries.
+        traces: Per item, the file that says where it hung.
+        should_stop: Polled often.
+
+    Yields:
+        Index and result of each item, as they come.
+
+    Raises:
+        Cancelled: If ``should_stop`` turned true; what is not finished is abandoned.
+    """
+    distributed = import_distributed()
+    waiting = deque(range(len(items)))
+    attempts, unstarted = [0] * len(items), [0] * len(items)
+    flying: dict[Any, tuple[int, str]] = {}
+    try:
+        while waiting or flying:
+            if should_stop is not None and should_stop():
+                raise Cancelled("stopped; finished tasks are kept")
+            present = set(client.nthreads())
+            idle = sorted(present - {address for _, address in flying.values()})
+            for address in idle[: len(waiting)]:
+                index = waiting.popleft()
+                attempts[index] += 1
+                traces[index].unlink(missing_ok=True)
+                future = client.submit(
+                    guarded, function, items[index], options.threads, options.time_limit, traces[index],
+                    workers=[address], pure=False,
+                )  # fmt: skip
+                flying[future] = index, address
+            done = _finished(flying, distributed)
+            gone = [f for f, (_, address) in flying.items() if f not in done and address not in present]
+            for future in [*done, *gone]:
+                index, _ = flying.pop(future)
+                if future.status == "finished":
+                    yield index, future.result()
+                elif future.status == "error" and not isinstance(future.exception(), distributed.KilledWorker):
+                    yield index, Lost(_said(future))
+                else:
+                    client.cancel([future], force=True)
+                    if not traces[index].exists() and unstarted[index] < _UNSTARTED:
+                        # It was given to a worker that was dying already.
+                        unstarted[index] += 1
+                        attempts[index] -= 1
+                        waiting.append(index)
+                    elif attempts[index] <= options.retries:
+                        waiting.append(index)
+                    else:
+                        yield index, Lost(_obituary(traces[index], attempts[index], options))
+    finally:
+        client.cancel(list(flying), force=True)
+
+
+def _finished(flying: dict[Any, tuple[int, str]], distributed: Any) -> list[Any]:
+    """Wait a moment for one of the futures to end; return those that have."""
+    if not flying:
+        time.sleep(_POLL_SECONDS)  # until there is a worker
+        return []
+    try:
+        return list(distributed.wait(list(flying), timeout=_POLL_SECONDS, return_when="FIRST_COMPLETED").done)
+    except (TimeoutError, distributed.TimeoutError):
+        return []
+
+
+def _said(future: Any) -> str:
+    error = future.exception()
+    return f"{type(error).__name__}: {error}"
+
+
+def _obituary(trace: Path, attempts: int, options: WorkerOptions) -> str:
+    times = f" {attempts} times" if attempts > 1 else ""
+    try:
+        hung = trace.stat().st_size > 0
+    except OSError:
+        hung = False
+    if hung:
+        return f"ended{times} after {options.time_limit:g} s, the time limit; {trace} says where it was"
+    trace.unlink(missing_ok=True)
+    return f"its process died{times} (killed, out of memory, or a crash in a library)"

@@ -1,0 +1,37 @@
+"""Frames whose depth cue contradicts what is known of the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.results.fusion.cue_error import fit_affine
+from uni4d_fg.results.fusion.densify import ControlPoints
+
+
+def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> list[int]:
+    """Return the frames whose cue, but for scale and shift of its disparity, is far worse than that of the others.
+
+    Every frame's cue is compared with the landmarks that it sees. A frame is named if what is left is both
+    ``broken_ratio`` times what is left in the median frame, and no less than ``broken_share`` of what a constant depth
+    would leave: a cue that still shows which is near and which is far is not broken.
+
+    Args:
+        control: Landmarks of all frames.
+        config: Thresholds.
+    """
+    left = np.full(len(control), np.nan)
+    constant = np.full(len(control), np.nan)
+    for frame, points in enumerate(control):
+        static = (points.instance == 0) & np.isfinite(points.log_scale) & (points.cue > 0)
+        if np.count_nonzero(static) < config.min_control_points:
+            continue
+        log_z = points.log_scale[static] + np.log(points.cue[static])
+        left[frame] = fit_affine(points.cue[static], log_z, np.ones(len(log_z)))[2]
+        constant[frame] = 1.4826 * np.median(np.abs(log_z - np.median(log_z)))
+    if np.isfinite(left).sum() < config.min_broken_frames:
+        return []
+    usual = max(float(np.nanmedian(left)), 1e-3)
+    with np.errstate(invalid="ignore"):
+        broken = (left > config.broken_ratio * usual) & (left > config.broken_share * constant)
+    return np.flatnonzero(broken).tolist()

@@ -1,0 +1,118 @@
+r"""What is wrong with a depth cue, measured against depth that is known, and taken out of it.
+
+A network's depth is wrong by scale and shift of its disparity, and by a smooth field on top,
+
+    1 / z = (a / D + b) exp(-f(x)).
+
+Both are fitted to depth from several views and to landmarks: (a, b) by reweighted least squares, f by averaging what is
+left over Gaussian windows, wide ones first, each shrunk towards the one before where little is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import Float32Array, FloatArray, evenly_spread
+from uni4d_fg.config.stages import FusionConfig
+
+_MAX_SAMPLES = 4000
+_ITERATIONS = 12
+_MIN_SAMPLES = 12
+_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class KnownDepth:
+    """Depth of one frame from elsewhere, at some pixels, at working size."""
+
+    log_depth: Float32Array
+    """(h, w), NaN where unknown."""
+    weight: Float32Array
+    """(h, w) not negative: 0 where unknown, about 1 where it is sure."""
+
+
+@dataclass(frozen=True)
+class CorrectedCue:
+    """A cue without what was found wrong with it."""
+
+    log_depth: Float32Array
+    """(h, w), NaN where the cue is missing."""
+    spread: float
+    """Spread of the affinely corrected cue's error over the frame (robust standard deviation of log depth)."""
+
+
+def fit_affine(cue: FloatArray, log_depth: FloatArray, weight: FloatArray) -> tuple[float, float, float]:
+    """Fit ``1 / z = a / cue + b`` robustly.
+
+    Args:
+        cue: (N,) m, positive.
+        log_depth: (N,) of the same pixels.
+        weight: (N,) not negative.
+
+    Returns:
+        a, b, and the robust standard deviation of the log depth that is left. A line that falls, or that makes depth
+        negative, is replaced by a scale alone.
+    """
+    inverse, wanted = 1.0 / cue, np.exp(-log_depth)
+    scale = float(np.exp(-_weighted_median(log_depth - np.log(cue), weight)))
+    a, b = scale, 0.0
+    for _ in range(_ITERATIONS):
+        left = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
+        sigma = max(_MAD * _weighted_median(np.abs(left), weight), 1e-4)
+        # Relative residuals: an error of inverse depth counts by how deep it is.
+        w = weight / (1.0 + (left / (2.0 * sigma)) ** 2) ** 2 / wanted**2
+        total = w.sum()
+        x, y = (w * inverse).sum() / total, (w * wanted).sum() / total
+        spread = (w * (inverse - x) ** 2).sum()
+        slope = (w * (inverse - x) * (wanted - y)).sum() / max(spread, 1e-12 * total)
+        shift = y - slope * x
+        if slope <= 0.2 * scale or slope > 5.0 * scale or (slope * inverse + shift).min() <= 0.1 * wanted.min():
+            slope, shift = scale, 0.0
+        done = abs(slope - a) + abs(shift - b) < 1e-6 * (abs(a) + abs(b))
+        a, b = slope, shift
+        if done:
+            break
+    left = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
+    return a, b, _MAD * _weighted_median(np.abs(left), weight)
+
+
+def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, config: FusionConfig) -> CorrectedCue:
+    """Take affine and smooth errors out of a cue.
+
+    Args:
+        cue: (h, w) m, NaN where missing.
+        known: What is known besides.
+        default_log_scale: Of the frame, where next to nothing is known.
+        config: Windows.
+    """
+    usable = np.isfinite(cue) & (known.weight > 0) & np.isfinite(known.log_depth)
+    rows, columns = np.nonzero(usable)
+    if len(rows) < _MIN_SAMPLES:
+        return CorrectedCue(np.log(cue) + np.float32(default_log_scale), np.nan)
+    some = evenly_spread(len(rows), _MAX_SAMPLES)
+    at = rows[some], columns[some]
+    a, b, spread = fit_affine(
+        cue[at].astype(np.float64), known.log_depth[at].astype(np.float64), known.weight[at].astype(np.float64)
+    )
+    inverse = np.float32(a) / cue + np.float32(b)
+    typical = 1.0 / float(np.exp(np.median(known.log_depth[at])))
+    log_depth = -np.log(np.maximum(inverse, np.float32(0.02 * typical)))
+    residual = np.where(usable, known.log_depth - log_depth, np.float32(0))
+    weight = np.where(usable & (np.abs(residual) < 4.0 * spread + 0.02), known.weight, np.float32(0))
+    field = np.zeros_like(cue)
+    width = cue.shape[1]
+    for share in config.field_windows:
+        sigma_px = share * width
+        mass = cv2.GaussianBlur(weight, (0, 0), sigma_px)
+        pull = cv2.GaussianBlur(weight * (residual - field), (0, 0), sigma_px)
+        field = field + pull / (mass + np.float32(config.field_prior))
+    return CorrectedCue(log_depth + field, spread)
+
+
+def _weighted_median(values: FloatArray, weight: FloatArray) -> float:
+    order = np.argsort(values)
+    mass = np.cumsum(weight[order])
+    return float(values[order[min(int(np.searchsorted(mass, 0.5 * mass[-1])), len(values) - 1)]])

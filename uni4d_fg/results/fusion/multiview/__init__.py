@@ -1,0 +1,1 @@
+"""Depth of the static scene from several views, with the solved cameras."""

@@ -1,0 +1,105 @@
+"""Static depth of every frame from several views, frame by frame, with how far it can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uni4d_fg.arrays import Float32Array, FloatArray
+from uni4d_fg.config.multiview import MultiviewConfig
+from uni4d_fg.geometry.camera import world_to_camera
+from uni4d_fg.results.fusion.averaging import average_over_frames
+from uni4d_fg.results.fusion.multiview.confidence import Evidence, confidence, relative_sigma
+from uni4d_fg.results.fusion.multiview.planes import choose_planes
+from uni4d_fg.results.fusion.multiview.sweep import sweep
+from uni4d_fg.results.fusion.multiview.views import choose_views
+from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Static depth of one frame at working size, (h, w) each."""
+
+    depth: Float32Array
+    """m; means nothing where something moves."""
+    confidence: Float32Array
+    """Probability that it is right to 3 %; 0 where there is none."""
+    sigma: Float32Array
+    """Standard deviation of its logarithm, if it is right."""
+
+
+@dataclass
+class _Raw:
+    depth: Float32Array
+    evidence: Evidence
+
+
+@dataclass
+class MultiviewDepth:
+    """Depth of frames by matching, kept as long as frames near them need it; frames are asked for in order."""
+
+    frames: Callable[[int], WorkingFrame]
+    size: WorkingSize
+    intrinsics: FloatArray
+    """(4,) px, of the images."""
+    world_T_cam: FloatArray
+    """(T, 4, 4)."""
+    seen: Callable[[int], FloatArray]
+    """The landmarks (N, 3) that a frame sees, world, m."""
+    config: MultiviewConfig
+    threads: int = 0
+    raw: dict[int, _Raw | None] = field(default_factory=dict)
+    shown: dict[int, WorkingFrame] = field(default_factory=dict)
+
+    def at(self, frame: int) -> Measured | None:
+        """Return the depth of a frame; None where the camera shows no parallax."""
+        offsets = self.config.compared_offsets
+        oldest = frame - max(offsets, default=0)
+        self.raw = {number: kept for number, kept in self.raw.items() if number >= oldest}
+        self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest - self.config.reach}
+        own = self._raw(frame)
+        if own is None:
+            return None
+        near = [frame + sign * offset for offset in offsets for sign in (-1, 1)]
+        others = [
+            (other.depth, self.world_T_cam[number], self.size.intrinsics(self.intrinsics))
+            for number in near
+            if 0 <= number < len(self.world_T_cam) and (other := self._raw(number)) is not None
+        ]
+        averaged = average_over_frames(
+            own.depth, self.world_T_cam[frame], others, self.size.intrinsics(self.intrinsics),
+            self.config.max_disagreement,
+        )  # fmt: skip
+        evidence = own.evidence.with_neighbors(averaged.agreeing, averaged.seeing)
+        return Measured(averaged.depth, confidence(evidence), relative_sigma(evidence))
+
+    def _raw(self, frame: int) -> _Raw | None:
+        if frame not in self.raw:
+            self.raw[frame] = self._match(frame)
+        return self.raw[frame]
+
+    def _shown(self, frame: int) -> WorkingFrame:
+        if frame not in self.shown:
+            self.shown[frame] = self.frames(frame)
+        return self.shown[frame]
+
+    def _match(self, frame: int) -> _Raw | None:
+        points, pose = self.seen(frame), self.world_T_cam[frame]
+        z = world_to_camera(np.broadcast_to(pose, (len(points), 4, 4)), points)[:, 2]
+        points, z = points[z > 0], z[z > 0]
+        views = choose_views(frame, self.world_T_cam, points, self.intrinsics, self.size.image_size, self.config)
+        if not views:
+            return None
+        other_T_cam = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
+        intrinsics = self.size.intrinsics(self.intrinsics)
+        planes = choose_planes(z, other_T_cam, intrinsics, (self.size.height, self.size.width), self.config)
+        image = self._shown(frame).gray
+        swept = sweep(
+            image, [self._shown(view).matched for view in views], other_T_cam, intrinsics, planes, self.config,
+            self.threads,
+        )  # fmt: skip
+        depth = (1.0 / swept.inverse_depth).astype(np.float32)
+        step = float(planes[1] - planes[0])
+        return _Raw(depth, Evidence.of(swept, step * depth, len(views)))

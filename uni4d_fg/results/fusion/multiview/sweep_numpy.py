@@ -1,0 +1,165 @@
+"""The plane sweep of ``cpp_factors/src/plane_sweep.cpp`` in NumPy: what it must give, and what runs without it.
+
+For every plane, each other image is warped onto the reference and compared by normalized cross-correlation over a
+window; of more than two images the two that match best count, so that a pixel which some do not see is still found.
+Costs are whole numbers: (1 - correlation) 127.5, 128 where nothing is known. Semi-global matching sums them along
+eight paths (Hirschmueller 2008), with a penalty for a change of plane that is lower across edges of the image.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+
+_UNKNOWN = 128
+
+
+def sweep_numpy(
+    image: Float32Array,
+    others: Float32Array,
+    turns: FloatArray,
+    shifts: FloatArray,
+    planes: FloatArray,
+    *,
+    radius: int,
+    noise: float,
+    small_step: int,
+    large_step: int,
+    edge_contrast: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Sweep an image.
+
+    Args:
+        image: (h, w), NaN where it is not to be matched.
+        others: (V, h, w) alike.
+        turns: (V, 3, 3) and
+        shifts: (V, 3): pixel x at inverse depth rho is seen at ``turns x + rho shifts``.
+        planes: (D,) inverse depths.
+        radius: Half side of the window, px.
+        noise: Standard deviation of the images' noise.
+        small_step: Penalty of a change by one plane.
+        large_step: Penalty of a larger change where the image is flat.
+        edge_contrast: Difference between pixels that halves it.
+
+    Returns:
+        The best plane as a number between them, its aggregated cost, that of the best plane elsewhere, and the
+        matching cost, (h, w) each.
+    """
+    costs = _matching_costs(image.astype(np.float32), others.astype(np.float32), turns, shifts, planes, radius, noise)
+    total = np.zeros(costs.shape, np.int32)
+    for step in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        for sign in (1, -1):
+            total += _path_costs(costs, image, (sign * step[0], sign * step[1]), small_step, large_step, edge_contrast)
+    return _choose(total, costs)
+
+
+def _matching_costs(
+    image: Float32Array, others: Float32Array, turns: FloatArray, shifts: FloatArray, planes: FloatArray,
+    radius: int, noise: float,
+) -> Int32Array:  # fmt: skip
+    """Return costs (h, w, D)."""
+    height, width = image.shape
+    reference = np.where(np.isfinite(image), image, np.float32(0))
+    inner = np.zeros(image.shape, bool)
+    inner[radius : height - radius, radius : width - radius] = True
+    known = inner & np.isfinite(image)
+    mean = _window_mean(reference, radius)
+    variance = np.maximum(_window_mean(reference * reference, radius) - mean * mean, 0)
+    noise2 = np.float32(noise) ** 2
+    costs = np.empty((height, width, len(planes)), np.int32)
+    for index, rho in enumerate(planes):
+        found = []
+        for other, turn, shift in zip(others, turns.astype(np.float32), shifts.astype(np.float32), strict=True):
+            warped, seen = _warp(other, turn, shift, np.float32(rho))
+            there = _window_mean(warped, radius)
+            spread = np.maximum(_window_mean(warped * warped, radius) - there * there, 0)
+            both = _window_mean(warped * reference, radius) - there * mean
+            zncc = both / np.sqrt((variance + noise2) * (spread + noise2))
+            cost = np.clip((1 - zncc) * np.float32(127.5) + np.float32(0.5), 0, 255).astype(np.int32)
+            found.append(np.where(known & seen, cost, _UNKNOWN))
+        ordered = np.sort(np.stack(found), axis=0)
+        costs[..., index] = (ordered[0] + ordered[1] + 1) // 2 if len(found) > 2 else ordered[0]
+    return costs
+
+
+def _window_mean(values: Float32Array, radius: int) -> Float32Array:
+    """Return the mean over windows; beyond the image there is 0."""
+    padded = np.pad(values, radius)
+    height, width = values.shape
+    side = 2 * radius + 1
+    rows = np.stack([padded[:, k : k + width] for k in range(side)]).sum(axis=0)
+    total = np.stack([rows[k : k + height] for k in range(side)]).sum(axis=0)
+    return np.asarray(total * np.float32(1 / side**2), np.float32)
+
+
+def _warp(
+    other: Float32Array, turn: Float32Array, shift: Float32Array, rho: np.float32
+) -> tuple[Float32Array, BoolArray]:
+    """Return another image as the reference sees it on a plane, and where that is known."""
+    height, width = other.shape
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    a, b, c = (turn[i, 0] * x + (turn[i, 1] * y + turn[i, 2] + rho * shift[i]) for i in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = a / c, b / c
+        inside = (c > 0) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    i, j = np.minimum(u.astype(np.int64), width - 2), np.minimum(v.astype(np.int64), height - 2)
+    p, q = u - i.astype(np.float32), v - j.astype(np.float32)
+    top = other[j, i] * (1 - p) + other[j, i + 1] * p
+    low = other[j + 1, i] * (1 - p) + other[j + 1, i + 1] * p
+    value = top * (1 - q) + low * q
+    known = inside & np.isfinite(value)
+    return np.where(known, value, np.float32(0)), known
+
+
+def _path_costs(
+    costs: Int32Array, image: Float32Array, step: tuple[int, int], small: int, large: int, contrast: float
+) -> Int32Array:
+    """Return the costs summed along paths that come from ``step`` (rows, columns) before, (h, w, D)."""
+    height, width, _ = costs.shape
+    dy, dx = step
+    before = np.roll(image, (dy, dx), axis=(0, 1))
+    difference = np.nan_to_num(np.abs(image - before))
+    jump = np.maximum(np.float32(large) / (1 + difference / np.float32(contrast)), small).astype(np.int32)
+    out = costs.copy()
+    if dy == 0:
+        for x in range(width)[:: 1 if dx > 0 else -1]:
+            if 0 <= x - dx < width:
+                out[:, x] += _least_step(out[:, x - dx], jump[:, x], small)
+        return out
+    for y in range(height)[:: 1 if dy > 0 else -1]:
+        if 0 <= y - dy < height:
+            here = slice(max(dx, 0), width + min(dx, 0))
+            there = slice(max(-dx, 0), width + min(-dx, 0))
+            out[y, here] += _least_step(out[y - dy, there], jump[y, here], small)
+    return out
+
+
+def _least_step(previous: Int32Array, jump: Int32Array, small: int) -> npt.NDArray[np.int32]:
+    """Return the least cost of coming from the previous pixels (N, D), less their least."""
+    least = previous.min(axis=1, keepdims=True)
+    best = np.minimum(previous, least + jump[:, None])
+    best[:, 1:] = np.minimum(best[:, 1:], previous[:, :-1] + small)
+    best[:, :-1] = np.minimum(best[:, :-1], previous[:, 1:] + small)
+    return np.asarray(best - least, np.int32)
+
+
+def _choose(total: Int32Array, costs: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    depth = total.shape[2]
+    best = total.argmin(axis=2)
+    least = total.min(axis=2)
+    beside = np.abs(np.arange(depth) - best[..., None]) <= 2
+    rival = np.where(beside, np.iinfo(np.int32).max, total).min(axis=2)
+    rival = np.where(rival == np.iinfo(np.int32).max, least, rival)
+
+    def at(index: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
+        return np.take_along_axis(total, np.clip(index, 0, depth - 1)[..., None], axis=2)[..., 0]
+
+    before, after = at(best - 1), at(best + 1)
+    bend = before + after - 2 * least
+    refinable = (best > 0) & (best < depth - 1) & (bend > 0)
+    shift = np.where(refinable, 0.5 * (before - after) / np.where(bend > 0, bend, 1), 0.0)
+    matching = np.take_along_axis(costs, best[..., None], axis=2)[..., 0]
+    return best + shift, least.astype(np.float64), rival.astype(np.float64), matching.astype(np.float64)

@@ -1,0 +1,66 @@
+"""Which frames see a frame well: enough parallax, not too much, and the same scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.multiview import MultiviewConfig
+from uni4d_fg.geometry.camera import project, world_to_camera
+
+
+def choose_views(
+    frame: int,
+    world_T_cam: FloatArray,
+    points: FloatArray,
+    intrinsics: FloatArray,
+    image_size: tuple[int, int],
+    config: MultiviewConfig,
+) -> list[int]:
+    """Return the frames to match a frame with, best first; none where nothing has parallax.
+
+    A view is worth the share of the points that it sees, times how near the median angle between the rays to them is
+    to the wanted one. Views are taken from before and after in turn, so that what one side does not see the other may.
+
+    Args:
+        frame: The frame.
+        world_T_cam: (T, 4, 4).
+        points: (N, 3) world, that the frame sees, m.
+        intrinsics: (4,) px.
+        image_size: (height, width), px.
+        config: Views.
+    """
+    if len(points) < config.min_points:
+        return []
+    height, width = image_size
+    here = points - world_T_cam[frame, :3, 3]
+    worth: dict[int, float] = {}
+    for other in range(max(0, frame - config.reach), min(len(world_T_cam), frame + config.reach + 1)):
+        if other == frame:
+            continue
+        there = points - world_T_cam[other, :3, 3]
+        seen_from = world_to_camera(np.broadcast_to(world_T_cam[other], (len(points), 4, 4)), points)
+        front = seen_from[:, 2] > 1e-6
+        uv = project(intrinsics, np.where(front[:, None], seen_from, [0.0, 0.0, 1.0]))
+        inside = front & (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < width) & (uv[:, 1] < height)
+        if inside.mean() < config.min_overlap:
+            continue
+        cosine = (here * there).sum(axis=1) / np.maximum(
+            np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1), 1e-12
+        )
+        angle = float(np.degrees(np.median(np.arccos(np.clip(cosine[inside], -1.0, 1.0)))))
+        if angle < config.min_angle_deg:
+            continue
+        ratio = angle / config.wanted_angle_deg
+        worth[other] = float(inside.mean()) * min(ratio, 1.0 / ratio)
+    sides = [sorted((o for o in worth if (o > frame) == after), key=lambda o: -worth[o]) for after in (False, True)]
+    chosen = _spread(sides, config.views)
+    return sorted(chosen, key=lambda other: -worth[other])
+
+
+def _spread(sides: list[list[int]], count: int) -> list[int]:
+    """Take the best of each side in turn, until there are enough; one side gives what the other lacks."""
+    each = [min(len(side), count // 2) for side in sides]
+    for mine, its in ((0, 1), (1, 0)):
+        each[mine] = min(len(sides[mine]), max(each[mine], count - each[its]))
+    return [frame for side, number in zip(sides, each, strict=True) for frame in side[:number]][:count]

@@ -1,0 +1,200 @@
+"""Static depth of one frame at working size: several views where they are sure, the corrected cue elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
+from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.results.fusion.cue_error import KnownDepth, correct_cue
+from uni4d_fg.results.fusion.multiview.measured import Measured
+
+_LANDMARK_SIGMA = 0.006
+"""Standard deviation of a landmark's log depth in a frame."""
+_LANDMARK_SHARE = 0.5
+"""Weight of a landmark beside a sure match."""
+_SURE = 0.8
+_MIN_COMPARED = 20
+"""Landmarks on sure matches that a comparison takes; with fewer, matched depth is taken to be off by ..."""
+_UNCHECKED_SIGMA = 0.05
+_AGREES = 0.04
+_AT_WORST, _AT_BEST = 0.75, 0.92
+"""Parts of the landmarks that agree with sure matches to that log depth: with the first nothing is believed of them."""
+_WRONG_SIGMA = 0.3
+"""Standard deviation of log depth where a match or the cue is wrong."""
+_USUALLY_RIGHT = 0.98
+"""Probability that a cue is right where there is nothing to compare it with ..."""
+_PRIOR_SHARE = 0.05
+"""... which counts as much as this part of the pixels around."""
+_BLUR_PX = 2
+"""Matched edges are blurred by this, working px."""
+_NEARBY_PX = 4.0
+_EDGE = 0.1
+"""Change of log depth that is an edge."""
+_LEAST_SIGMA = 0.003
+_UNCOMPARED_SIGMA = 0.1
+"""Of a cue that nothing can be compared with."""
+_JUDGES = 0.5
+"""Matched depth that is less reliable does not judge the cue."""
+
+
+@dataclass(frozen=True)
+class StaticDepth:
+    """Static depth of one frame, (h, w) each."""
+
+    log_depth: Float32Array
+    """NaN where nothing is known."""
+    sigma: Float32Array
+    """Standard deviation of its error, as far as it is known."""
+    spread: float
+    """How much the cue disagrees with what is known; NaN where next to nothing is."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What one frame's cue is corrected and judged by."""
+
+    depth: KnownDepth
+    shared_sigma: float
+    """Standard deviation of the error of matched log depth that neighboring pixels share."""
+    reliability: float
+    """0 to 1: how far the confidence in matched depth is to be believed in this frame."""
+    landmark_spread: float = np.inf
+    """Standard deviation of what matched log depth differs from landmarks by; infinite where too few compare."""
+
+
+def known_depth(
+    measured: Measured | None, uv: FloatArray, log_z: FloatArray, static: BoolArray, shape: tuple[int, int]
+) -> Known:
+    """Bring depth from several views and landmarks onto one grid.
+
+    Few views know less of depth than landmarks, which all frames together place: what the matched depth differs from
+    them by, beyond their own noise, is an error that pixels near each other share. Where it often contradicts them
+    (blurred frames, a rolling shutter, poor cameras), it is believed less than it asks for.
+
+    Args:
+        measured: Depth from several views, if there is any.
+        uv: (N, 2) landmarks, working px.
+        log_z: (N,) their log depth.
+        static: (h, w) where nothing moves.
+        shape: (h, w).
+    """
+    column, row = np.rint(uv).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
+    inside[inside] = static[row[inside], column[inside]]
+    at, log_z = (row[inside], column[inside]), log_z[inside]
+    log_depth = np.full(shape, np.nan, np.float32)
+    weight = np.zeros(shape, np.float32)
+    shared, reliability, spread = 0.0, 0.0, float("inf")
+    if measured is not None:
+        log_depth = np.log(measured.depth)
+        weight = np.where(static, np.maximum(measured.confidence - 0.5, 0) * 2, np.float32(0)).astype(np.float32)
+        sure = measured.confidence[at] > _SURE
+        shared = _UNCHECKED_SIGMA
+        if np.count_nonzero(sure) >= _MIN_COMPARED:
+            difference = log_depth[at][sure] - log_z[sure]
+            difference -= np.median(difference)
+            spread = 1.4826 * float(np.median(np.abs(difference)))
+            shared = float(np.sqrt(max(spread**2 - _LANDMARK_SIGMA**2, 0.0)))
+            agreeing = float(np.mean(np.abs(difference) < _AGREES))
+            reliability = float(np.clip((agreeing - _AT_WORST) / (_AT_BEST - _AT_WORST), 0.0, 1.0))
+        # Squared: pixels that share an error are not as many witnesses as there are pixels.
+        weight *= np.float32(reliability * (_LANDMARK_SIGMA**2 / (_LANDMARK_SIGMA**2 + shared**2)) ** 2)
+    trusted = weight[at] < _LANDMARK_SHARE
+    at = at[0][trusted], at[1][trusted]
+    log_depth[at] = log_z[trusted]
+    weight[at] = _LANDMARK_SHARE
+    return Known(KnownDepth(log_depth, weight), shared, reliability, spread)
+
+
+def fuse_static(
+    cue: Float32Array,
+    measured: Measured | None,
+    known: Known,
+    default_log_scale: float,
+    config: FusionConfig,
+) -> StaticDepth:
+    """Weigh the corrected cue and the depth from several views by their precision.
+
+    Args:
+        cue: (h, w) m, NaN where missing.
+        measured: Depth from several views, if there is any.
+        known: What the cue is corrected by.
+        default_log_scale: Of the frame, where next to nothing is known.
+        config: Fusion.
+    """
+    shape = known.depth.weight.shape
+    corrected = correct_cue(cue, known.depth, default_log_scale, config)
+    if measured is None or known.reliability == 0.0:
+        spread = corrected.spread if np.isfinite(corrected.spread) else _UNCOMPARED_SIGMA
+        sigma = np.full(shape, max(spread, _LANDMARK_SIGMA), np.float32)
+        return StaticDepth(corrected.log_depth, sigma, corrected.spread)
+    cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
+    has_cue = np.isfinite(corrected.log_depth)
+    seen = np.log(measured.depth)
+    p = np.clip(known.reliability * measured.confidence, 1e-3, 1 - 1e-3)
+    difference = np.where(has_cue, seen - np.where(has_cue, corrected.log_depth, 0), 0)
+    matched = np.hypot(measured.sigma, np.float32(known.shared_sigma))
+    # Three explanations: both are right, the match alone is, or the cue alone is.
+    both = p * cue_right * _normal(difference, matched**2 + cue_sigma**2)
+    match_alone = p * (1 - cue_right) * _normal(difference, _WRONG_SIGMA**2 + matched**2)
+    cue_alone = (1 - p) * cue_right * _normal(difference, _WRONG_SIGMA**2 + cue_sigma**2)
+    gain = cue_sigma**2 / (matched**2 + cue_sigma**2)
+    gain = np.where(both > np.maximum(match_alone, cue_alone), gain, match_alone > cue_alone)
+    gain = np.where(has_cue, gain, 1.0)
+    log_depth = np.where(has_cue, np.where(has_cue, corrected.log_depth, 0) + gain * difference, seen)
+    sigma = np.hypot((1 - gain) * cue_sigma, gain * matched)
+    # The part of the time that the choice is wrong: a mean absolute error of its own.
+    sigma = np.where(has_cue | (p > 0.5), sigma, np.float32(_WRONG_SIGMA))
+    return StaticDepth(log_depth.astype(np.float32), sigma.astype(np.float32), corrected.spread)
+
+
+def spread_at_landmarks(static: StaticDepth, known: Known) -> float:
+    """Return by how much (standard deviation, log) depth differs from landmarks; infinite without any.
+
+    Args:
+        static: Depth.
+        known: Landmarks alone.
+    """
+    compared = (known.depth.weight > 0) & np.isfinite(static.log_depth)
+    if not compared.any():
+        return float("inf")
+    return 1.4826 * float(np.median(np.abs(known.depth.log_depth[compared] - static.log_depth[compared])))
+
+
+def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tuple[Float32Array, Float32Array]:
+    """Return the standard deviation (h, w) of a corrected cue where it is right, and the probability that it is.
+
+    Matching blurs edges by its window, so that pixels beside an edge of the matched depth do not witness against
+    the cue; those a little farther away do: a cue that bleeds across edges is found out there.
+    """
+    seen = np.log(measured.depth)
+    window = np.ones((2 * _BLUR_PX + 1,) * 2, np.uint8)
+    beside = cv2.dilate(seen, window) - cv2.erode(seen, window) > _EDGE
+    usable = np.isfinite(log_cue) & (known.depth.weight > 0) & ~beside
+    left = np.where(usable, np.abs(known.depth.log_depth - log_cue), np.float32(0))
+    if not usable.any():
+        return np.full_like(log_cue, 0.05), np.full_like(log_cue, _USUALLY_RIGHT)
+    if known.reliability < _JUDGES:
+        usual = 1.4826 * float(np.median(left[usable]))
+        return np.full_like(log_cue, max(usual, _LEAST_SIGMA)), np.full_like(log_cue, _USUALLY_RIGHT)
+    usual = 1.4826 * float(np.median(left[usable]))
+    wrong = usable & (left > 4.0 * usual + 0.02)
+    count = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), _NEARBY_PX)
+    failures = cv2.GaussianBlur(wrong.astype(np.float32), (0, 0), _NEARBY_PX)
+    right = 1 - (failures + _PRIOR_SHARE * (1 - _USUALLY_RIGHT)) / (count + _PRIOR_SHARE)
+    fine = usable & ~wrong
+    mass = cv2.GaussianBlur(fine.astype(np.float32), (0, 0), 4 * _NEARBY_PX)
+    squares = cv2.GaussianBlur(np.where(fine, left, np.float32(0)) ** 2, (0, 0), 4 * _NEARBY_PX)
+    noise = np.nanmedian(measured.sigma) ** 2 + known.shared_sigma**2
+    variance = (squares + _PRIOR_SHARE * usual**2) / (mass + _PRIOR_SHARE) - noise
+    return np.sqrt(np.maximum(variance, _LEAST_SIGMA**2)).astype(np.float32), right.astype(np.float32)
+
+
+def _normal(difference: FloatArray | Float32Array, variance: FloatArray | Float32Array) -> Float32Array:
+    """Return a normal density, (h, w), but for a constant factor."""
+    density = np.exp(-0.5 * np.minimum(difference**2 / variance, 100)) / np.sqrt(variance)
+    return np.asarray(density, dtype=np.float32)

@@ -1,0 +1,88 @@
+// Level of detail for point clouds that are drawn in a page of viser, which draws every point every time.
+//
+// Clouds come in chunks whose points are ordered so that any first part of them covers the chunk evenly
+// (uni4d_fg/results/chunks.py). Here less of a chunk is drawn where its points are smaller than a pixel or the
+// chunk is out of sight, and, while the picture changes, as much as the machine draws at the wanted rate; what is left
+// out is made up for by larger points. A picture that stands still gets several times as much. Where a name that this
+// relies on is not found, everything is drawn.
+(() => {
+  if (window.uni4dDetail || !window.WebGL2RenderingContext) return;
+  const TARGET_MS = 38, TOUCH_MS = 300, STILL_FACTOR = 6, FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24;
+  const state = (window.uni4dDetail = { budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false });
+  const gl2 = WebGL2RenderingContext.prototype;
+  const NAMES = ["scale", "modelViewMatrix", "projectionMatrix"];
+  const located = new WeakMap(), values = new WeakMap();
+  let program = null, asked = 0, shown = 0, moving = false, begun = false, before = 0, drewBefore = false, touched = -1e9;
+
+  const wrap = (name, make) => { const inner = gl2[name]; gl2[name] = make(inner); return inner; };
+  wrap("useProgram", (inner) => function (next) { program = next; return inner.call(this, next); });
+  wrap("getUniformLocation", (inner) => function (owner, name) {
+    const place = inner.call(this, owner, name);
+    if (place && NAMES.includes(name)) {
+      if (!located.has(owner)) located.set(owner, {});
+      located.get(owner)[name] = place;
+      values.set(place, null);
+    }
+    return place;
+  });
+  const setNumber = wrap("uniform1f", (inner) => function (place, value) {
+    if (place && values.has(place)) values.set(place, value);
+    return inner.call(this, place, value);
+  });
+  wrap("uniformMatrix4fv", (inner) => function (place, transpose, data, ...rest) {
+    if (place && values.has(place)) values.set(place, Float32Array.from(data));
+    return inner.call(this, place, transpose, data, ...rest);
+  });
+
+  // How much of a chunk there is to see: 0 out of sight, 1 where its points are a pixel or more apart.
+  const worth = (view, projection, scale) => {
+    const radius = 1.8 * Math.hypot(view[0], view[1], view[2]), depth = -view[14];
+    if (depth < -radius) return 0;
+    for (const [axis, focal] of [[12, projection[0]], [13, projection[5]]])
+      if (Math.abs(view[axis]) * focal - depth > radius * Math.hypot(focal, 1)) return 0;
+    const pixels = scale / Math.max(depth - radius, 1e-6);
+    return Math.min(1, pixels * pixels);
+  };
+  const draw = wrap("drawArrays", (inner) => function (mode, first, count) {
+    const places = mode === this.POINTS && count > SMALL && !state.everything && program && located.get(program);
+    const [scale, view, projection] = places ? NAMES.map((name) => values.get(places[name])) : [];
+    if (!scale || !view || !projection) return inner.call(this, mode, first, count);
+    if (!begun) {
+      begun = true;
+      // viser draws once a second when nothing changes, and frame after frame when something does.
+      moving = drewBefore || performance.now() - touched < TOUCH_MS;
+    }
+    const part = worth(view, projection, scale);
+    if (part === 0) return;
+    asked += part * count;
+    const budget = moving ? state.budget : STILL_FACTOR * state.budget;
+    const fraction = part * Math.min(1, budget / Math.max(state.wanted, 1));
+    const number = Math.max(1, Math.ceil(fraction * count));
+    shown += number;
+    if (number >= count) return inner.call(this, mode, first, count);
+    const depth = Math.max(-view[14], 1e-6), size = scale / depth;
+    const larger = Math.max(size, Math.min(Math.max(size / Math.sqrt(number / count), 1), LARGEST_PX));
+    setNumber.call(this, places.scale, larger * depth);
+    inner.call(this, mode, first, number);
+    setNumber.call(this, places.scale, scale);
+  });
+
+  for (const kind of ["pointerdown", "pointermove", "wheel"])
+    window.addEventListener(kind, (event) => { if (event.buttons || kind === "wheel") touched = performance.now(); }, true);
+  const tick = (now) => {
+    const drew = begun;
+    if (drew) {
+      state.wanted = asked; state.drawn = shown; state.frames += 1;
+      asked = shown = 0; begun = false;
+      if (drewBefore && moving) {
+        state.milliseconds += 0.3 * (Math.min(now - before, 500) - state.milliseconds);
+        const ratio = TARGET_MS / Math.max(state.milliseconds, 1);
+        if (ratio < 0.9 || ratio > 1.1) state.budget *= Math.min(Math.max(ratio, 0.7), 1.1);
+        state.budget = Math.min(Math.max(state.budget, FEWEST), MOST);
+      }
+    }
+    drewBefore = drew; before = now;
+    requestAnimationFrame(tick);
+  };
+  requestAnimationFrame(tick);
+})();

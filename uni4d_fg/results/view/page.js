@@ -1,0 +1,29 @@
+// What the viewer's page does beyond viser: keys go to one place, and a phone shows the scene first.
+(() => {
+  if (window.uni4dPage) return;
+  window.uni4dPage = true;
+  document.addEventListener("DOMContentLoaded", () => {
+    // viser's hotkeys listen at the document: a slider or a button that has the focus has used the key already.
+    document.body.addEventListener("keydown", (event) => {
+      const target = event.target;
+      const slides = target.getAttribute("role") === "slider" && event.key.startsWith("Arrow");
+      if (slides || (target.tagName === "BUTTON" && event.code === "Space")) event.stopPropagation();
+    });
+    // A check box that was clicked would keep the arrow keys to itself.
+    document.body.addEventListener("click", (event) => {
+      if (event.detail > 0 && event.target.type === "checkbox") event.target.blur();
+    });
+    // On narrow screens viser shows its panel over the lower half of the picture, with no option to begin closed.
+    if (!window.matchMedia("(max-width: 36em)").matches) return;
+    const sheet = () => [...document.querySelectorAll("div")].find(
+      (div) => div.style.position === "fixed" && div.style.bottom === "0px" && div.style.maxHeight === "60%");
+    const watch = new MutationObserver(() => {
+      const handle = sheet()?.querySelector('div[style*="cursor: pointer"]');
+      if (!handle) return;
+      watch.disconnect();
+      handle.click();
+    });
+    watch.observe(document.body, { childList: true, subtree: true });
+    setTimeout(() => watch.disconnect(), 20000);
+  });
+})();

@@ -1,0 +1,93 @@
+"""Whether a camera zooms, and how: the focal length of every frame, where the images ask for it.
+
+At the minimum of a camera that does not zoom, a few undamped steps with a focal length per frame tell by which part the
+reprojection energy would fall; the errors of a tracker reach no fixed part of it, as with the lens. Only where they do,
+everything is solved to the end. A zoom moves all pixels alike, motion along the view moves near ones more: the two are
+told apart by the relief of the scene and by its depth. The covariance of the solve says how well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.camera import CameraConfig
+from uni4d_fg.slam.lens.zoom_fit import FittedZoom, ZoomFit
+from uni4d_fg.slam.stages.scene import StaticScene
+
+
+@dataclass(frozen=True)
+class ZoomCalibration:
+    """What was found."""
+
+    zoom: FloatArray | None
+    """(T,) focal length of each frame over that of the intrinsics, at most 1; None where the camera does not zoom."""
+    intrinsics: FloatArray
+    """(4,) px, of the longest focal length."""
+    evidence: float
+    """Part of the reprojection energy that a focal length per frame takes away."""
+    open_by: float
+    """Standard deviation of the log focal length, relative to the first frame, where it is largest."""
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def find_zoom(work: ZoomFit, scene: StaticScene, num_frames: int, config: CameraConfig) -> ZoomCalibration:
+    """Find the focal length of every frame.
+
+    Args:
+        work: The tracks, and how they are fitted.
+        scene: Stages 1 and 2 of a camera that does not zoom.
+        num_frames: T of the video.
+        config: What is asked for.
+
+    Raises:
+        DegenerateProblemError: If the cues do not determine the cameras.
+        SolverError: If a system is singular or a cue is not finite.
+    """
+    stride = int(work.frames[1] - work.frames[0]) if len(work.frames) > 1 else 1
+    none = ZoomCalibration(None, scene.cameras.intrinsics, 0.0, 0.0)
+    if work.frames[-1] + stride < num_frames:
+        return replace(none, notes=(f"no zoom was sought: tracks are too short for {num_frames} frames",))
+    probe = work.probe(scene)
+    warnings = _warnings(probe)
+    moved = float(np.ptp(probe.zoom))
+    if config.zoom == "auto" and (probe.evidence < config.min_zoom_evidence or moved < _PROBED * config.min_zoom):
+        note = f"a focal length per frame would lower the reprojection energy by {100 * probe.evidence:.2f} %"
+        return ZoomCalibration(None, scene.cameras.intrinsics, probe.evidence, _spread(probe), (note,), warnings)
+    found = work.solve(scene)
+    for _ in range(1, config.rounds):
+        found = work.refine(found)
+    warnings = _warnings(found)
+    span = float(np.expm1(np.ptp(found.zoom)))
+    note = f"a focal length per frame lowers the reprojection energy by {100 * found.evidence:.2f} %"
+    if config.zoom == "auto" and (found.evidence < config.min_zoom_evidence or span < config.min_zoom):
+        note += f" and varies by {100 * span:.1f} % only"
+        return ZoomCalibration(None, scene.cameras.intrinsics, found.evidence, _spread(found), (note,), warnings)
+    focal = found.intrinsics[0] * np.exp(np.interp(np.arange(num_frames), work.frames, found.zoom))
+    said = f"the camera zooms: fx from {focal.min():.1f} to {focal.max():.1f} px"
+    return ZoomCalibration(
+        focal / found.intrinsics[0], found.intrinsics, found.evidence, _spread(found), (said, note), warnings
+    )
+
+
+_PROBED = 0.4
+"""Part of a zoom that the undamped steps of the probe find, at least."""
+
+_OPEN = 0.03
+"""Standard deviation of the log focal length from which it counts as open."""
+
+
+def _spread(fit: FittedZoom) -> float:
+    return float("nan") if fit.sigma is None else float(fit.sigma.max())
+
+
+def _warnings(fit: FittedZoom) -> tuple[str, ...]:
+    """Return what is to be said where zoom and motion along the view cannot be told apart."""
+    spread = _spread(fit)
+    if spread <= _OPEN:
+        return ()
+    known = f"the focal length of a frame is open by {100 * spread:.0f} %" if np.isfinite(spread) else "it is open"
+    return (f"zoom and motion along the view can hardly be told apart: {known}, and the path with it",)

@@ -1,0 +1,116 @@
+"""Fitting a zoom: bundle adjustment with the focal length of every frame as a variable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.static_reprojection import static_reprojection
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE, ZOOM
+from uni4d_fg.factors.zoom import zoom_smoothness, zoomed_reprojection
+from uni4d_fg.geometry.lens import PINHOLE
+from uni4d_fg.optim.marginals import camera_marginals
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import Stage
+from uni4d_fg.slam.lens.fit import LensFit
+from uni4d_fg.slam.lens.tracks import unzoomed_tracks
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
+from uni4d_fg.slam.stages.energy import MAP
+from uni4d_fg.slam.stages.scene import StaticScene
+
+
+@dataclass(frozen=True)
+class FittedZoom:
+    """The end of one fit."""
+
+    zoom: FloatArray
+    """(F,) log focal length of each frame over that of the intrinsics; the longest is 0."""
+    intrinsics: FloatArray
+    """(4,) px, of the frame with the longest focal length."""
+    evidence: float
+    """Part of the reprojection energy that was lost when the zoom was set free."""
+    sigma: FloatArray | None
+    """(F,) standard deviation of the zoom relative to the first frame; None where nothing is known of it."""
+
+
+@dataclass(frozen=True)
+class ZoomFit:
+    """Fits zooms to the tracks that a lens is sought from."""
+
+    fit: LensFit
+    frames: np.ndarray
+    """(F,) frames of the video that the tracks are of, ascending."""
+
+    def probe(self, scene: StaticScene) -> FittedZoom:
+        """Set the zoom free at the minimum of a camera that does not zoom, for a few undamped steps."""
+        steps = {"max_iterations": self.fit.config.camera.probe_steps, "initial_damping": 1e-9}
+        return self.solve(scene, steps)
+
+    def refine(self, start: FittedZoom) -> FittedZoom:
+        """Undo a zoom, run stages 1 and 2 again, and find what is left of it.
+
+        The first solve begins at cameras that moved where they should have zoomed, and may end short of the minimum.
+
+        Raises:
+            DegenerateProblemError: If the cues do not determine the cameras.
+            SolverError: If a system is singular or a cue is not finite.
+        """
+        tracks = unzoomed_tracks(self.fit.tracks, start.intrinsics, start.zoom)
+        work = ZoomFit(replace(self.fit, tracks=tracks), self.frames)
+        left = work.solve(work.fit.scene(PINHOLE, start.intrinsics))
+        zoom, intrinsics = start.zoom + left.zoom, left.intrinsics.copy()
+        longest = float(zoom.max())
+        intrinsics[:2] *= np.exp(longest)
+        return replace(left, zoom=zoom - longest, intrinsics=intrinsics, evidence=start.evidence)
+
+    def solve(self, scene: StaticScene, options: Mapping[str, float] | None = None) -> FittedZoom:
+        """Solve everything together, from a camera that does not zoom.
+
+        Args:
+            scene: Stages 1 and 2 of such a camera.
+            options: Changes of the solver's settings; to the end when None.
+
+        Raises:
+            SolverError: If a system is singular.
+            Cancelled: If the user interrupts.
+        """
+        camera, ba = self.fit.config.camera, self.fit.config.bundle_adjustment
+        problem, state = self._problem(scene)
+        to_the_end = {"relative_decrease": camera.relative_decrease, "max_iterations": camera.max_iterations}
+        solver = ba.solver.model_copy(update=dict(options or to_the_end))
+        before = problem.energies(state)["static_reprojection"]
+        stage = Stage("lens", problem.fix(ZOOM, rows=[0]), solver, part="zoom")
+        state, after = self.fit.run(stage, state, self.fit.hooks)
+        self.fit.note([after])
+        gain = after.initial_energy - after.final_energy
+        marginals = camera_marginals(stage.problem, state, solver)
+        sigma = None if marginals is None else np.sqrt(marginals.blocks(ZOOM, len(self.frames))[:, 0, 0])
+        zoom, intrinsics = state[ZOOM][:, 0], state[INTRINSICS][0].copy()
+        longest = float(zoom.max())
+        intrinsics[:2] *= np.exp(longest)
+        return FittedZoom(zoom - longest, intrinsics, gain / max(before, 1e-300), sigma)
+
+    def _problem(self, scene: StaticScene) -> tuple[Problem, State]:
+        """Return bundle adjustment of a scene with the zoom in place of one focal length."""
+        fit, seen, plain = self.fit, scene.observations, scene.state()
+        ba, count = fit.config.bundle_adjustment, len(self.frames)
+        state = State({**plain.arrays, ZOOM: np.zeros((count, 1))}, plain.index)
+        others = bundle_adjustment_problem(
+            plain, seen, scene.noise, ba, fit.prior_intrinsics[None], Freedom(poses=True, intrinsics=True),
+            acceleration=scene.acceleration,
+        )  # fmt: skip
+        problem = Problem.over(state).eliminate(LANDMARK).fix(POSE, rows=[0])
+        if not ba.free_principal_point:
+            problem.fix(INTRINSICS, entries=[2, 3])
+        problem.add(batch for batch in others.batches if batch.factor_type is not static_reprojection)
+        _, row = seen.rows()
+        sigma = scene.noise.reprojection_sigma_px
+        noise = MAP.observed(sigma, seen.weight, ba.reprojection_kernel, seen.frame, count)
+        problem.add(zoomed_reprojection(seen.frame, row, 0, seen.frame, uv=seen.uv, **noise))
+        first = np.arange(count - 1)
+        step = fit.config.camera.zoom_per_frame * np.sqrt(np.diff(self.frames))
+        return problem.add(zoom_smoothness(first, first + 1, sigma=step[:, None])), state
