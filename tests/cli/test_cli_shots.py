@@ -92,7 +92,6 @@ def test_resume_takes_every_shot_over(cli: Run, joined: Path, split: Path) -> No
     assert "several shots" in err
 
 
-@pytest.mark.xfail(reason="the report of a shot with zoomed or missing frames fails on shapes", strict=False)
 def test_verbs_go_over_the_shots_or_list_them(cli: Run, split: Path) -> None:
     code, out, _ = cli("evaluate", split, "--json")
     assert code == 0

@@ -63,6 +63,14 @@ def test_ideal_pixels_undo_real_ones(lens: Lens) -> None:
     np.testing.assert_allclose(lens.magnification(K, ideal), 1.0 / area, rtol=2e-3)
 
 
+@pytest.mark.parametrize("lens", [OPENCV, FISHEYE])
+def test_every_pixel_may_have_intrinsics_of_its_own(lens: Lens, rng: np.random.Generator) -> None:
+    ideal = pixels()
+    intrinsics = K * rng.uniform(0.8, 1.2, (len(ideal), 1))
+    one_by_one = [lens.real_pixels(own, pixel) for own, pixel in zip(intrinsics, ideal, strict=True)]
+    np.testing.assert_allclose(lens.real_pixels(intrinsics, ideal), one_by_one, atol=1e-9)
+
+
 @given(st.floats(-0.2, 0.25), st.floats(-0.01, 0.01), st.floats(0.0, 639.0), st.floats(0.0, 479.0))
 def test_the_inverse_is_exact_where_there_is_one(k1: float, p1: float, u: float, v: float) -> None:
     lens = Lens("OPENCV", (k1, 0.0, p1, 0.0))

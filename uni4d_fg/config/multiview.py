@@ -10,7 +10,6 @@ class MultiviewConfig(Section):
 
     enabled: bool = setting(True, "Match frames; otherwise dense depth is the corrected cue alone.")
     longer_side_px: int = setting(320, "Frames are matched at a size whose longer side is at most this, px.", ge=32)
-    stride: int = setting(1, "Every this many frames are matched; the others take their depth.", ge=1)
     views: int = setting(4, "Frames that a frame is matched with, at most.", ge=1, le=16)
     reach: int = setting(16, "They are at most this many frames away.", ge=1)
     min_overlap: float = setting(0.5, "A view sees at least this part of the frame's landmarks.", ge=0, le=1)

@@ -187,10 +187,11 @@ class Lens:
         return out
 
     def real_pixels(self, intrinsics: FloatArray, ideal: FloatArray) -> FloatArray:
-        """Return where the image shows what a pinhole with (4,) intrinsics shows at pixels (..., 2)."""
+        """Return where the image shows what a pinhole with intrinsics (4,) or (..., 4) shows at pixels (..., 2)."""
         if self.is_pinhole:
             return ideal
-        return self._bent((ideal - intrinsics[2:]) / intrinsics[:2]) * intrinsics[:2] + intrinsics[2:]
+        focal, center = intrinsics[..., :2], intrinsics[..., 2:]
+        return self._bent((ideal - center) / focal) * focal + center
 
     def ideal_pixels(self, intrinsics: FloatArray, real: FloatArray) -> FloatArray:
         """Return where a pinhole with (4,) intrinsics shows what the image shows at pixels (..., 2).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,18 +78,14 @@ def fuse_depth(
         unmatched = "is not made of frames that zoom"
     elif config.multiview.enabled and not hasattr(core, "plane_sweep"):
         unmatched = f"needs the C++ extension: {INSTALL_COMMAND}"
-    if unmatched:
-        off = config.multiview.model_copy(update={"enabled": False})
-        config = config.model_copy(update={"multiview": off})
     control = [control_points(labelled, scene, motion, frame) for frame in range(sequence.num_frames)]
     broken = contradicting_frames(control, config)
     intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)
     maps = DenseMaps(sequence, control, scene, config, intrinsics, frozenset(broken), unmatched)
     if not unmatched and not maps.gains_by_matching():
-        off = config.multiview.model_copy(update={"enabled": False})
-        config = config.model_copy(update={"multiview": off})
         unmatched = "adds nothing to this cue, as landmarks say"
-    maps = DenseMaps(sequence, control, scene, config, intrinsics, frozenset(broken), unmatched)
+    # Anew, as the frames that were tried are not in order.
+    maps = replace(maps, unmatched=unmatched, matched=0, made={})
     with write_depth(path, sequence.num_frames, sequence.image_size) as writer:
         for frame in range(sequence.num_frames):
             if should_stop():
@@ -202,7 +198,7 @@ class DenseMaps:
             broken = frame in self.broken
             cue = self._carried(frame) if broken else self.size.depth(self._given(frame))
             shown = self.multiview.shown.get(frame) or self._working_frame(frame)
-            measured = self.multiview.at(frame) if self.config.multiview.enabled else None
+            measured = None if self.unmatched else self.multiview.at(frame)
             mine = self.control[frame]
             usable = (mine.instance == 0) & np.isfinite(mine.log_scale)
             uv = self.size.pixels(mine.uv[usable])

@@ -24,7 +24,8 @@ import numpy as np
 import yaml
 
 from uni4d_fg.arrays import FloatArray
-from uni4d_fg.errors import InputError
+from uni4d_fg.config.yaml_text import parse_yaml
+from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.files import atomic_write_text
 
 CSV_NAME, YAML_NAME = "imu.csv", "imu.yaml"
@@ -231,8 +232,8 @@ def _device(file: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        read = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        read = parse_yaml(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ConfigError) as error:
         raise InputError(f"{file}: cannot be read ({error})") from error
     allowed = ("noise", "body_T_cam", "time_offset")
     if not isinstance(read, dict) or set(read) - set(allowed):

@@ -20,6 +20,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.config.yaml_text import parse_yaml
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.pipeline.benchmark.task import Configuration, Masks, check_names
 from uni4d_fg.reading import read_text
@@ -74,8 +75,8 @@ def read_grid(path: Path) -> list[Configuration]:
         ConfigError: If it is not of that form, a field is unknown, a value not allowed, or a name used twice.
     """
     try:
-        found = _File.model_validate(yaml.safe_load(read_text(path)) or {})
-    except (yaml.YAMLError, ValidationError) as error:
+        found = _File.model_validate(parse_yaml(read_text(path)) or {})
+    except (ConfigError, ValidationError) as error:
         raise ConfigError(f"{path}: is not a list of configurations ({_said(error)})") from error
     if not found.rows and not found.grid:
         raise ConfigError(f"{path}: has neither rows nor a grid; name at least one configuration")

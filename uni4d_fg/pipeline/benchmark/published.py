@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import yaml
 from pydantic import TypeAdapter, ValidationError
 
+from uni4d_fg.config.yaml_text import parse_yaml
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.pipeline.benchmark.table import Row
 from uni4d_fg.reading import read_text
@@ -59,9 +58,8 @@ def read_published(path: Path = FILE) -> list[Published]:
         ConfigError: If it is not of that form.
     """
     try:
-        found: Any = yaml.safe_load(read_text(path))
-        tables = TypeAdapter(list[_PrintedTable]).validate_python(found)
-    except (yaml.YAMLError, ValidationError) as error:
+        tables = TypeAdapter(list[_PrintedTable]).validate_python(parse_yaml(read_text(path)))
+    except (ConfigError, ValidationError) as error:
         raise ConfigError(f"{path}: is not a list of printed tables ({error})") from error
     rows = []
     for table in tables:
