@@ -102,7 +102,8 @@ def check_run(run_dir: Path, sequence: Sequence) -> Reconstruction:
     summary = json.loads(folder.summary.read_text())
     for solve in solves_of(summary["stages"]):
         assert np.isfinite(solve["initial_energy"])
-        assert solve["final_energy"] <= solve["initial_energy"], solve["name"]
+        # A start at the minimum has an energy of rounding errors alone.
+        assert solve["final_energy"] <= max(solve["initial_energy"], 1e-18), solve["name"]
     assert temporary_files(run_dir) == []
     return reconstruction
 

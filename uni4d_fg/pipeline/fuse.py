@@ -183,7 +183,8 @@ class DenseMaps:
             smooth = self.size.enlarge(log_depth)
             blended = np.where(np.isfinite(smooth), (1 - edge) * np.nan_to_num(smooth) + edge * detailed, detailed)
             # Beside missing depth nothing is known at working size: there the cue has its frame's usual error.
-            usual = np.log(raw) + np.float32(np.nanmedian(log_depth - np.log(cue)))
+            known = (log_depth - np.log(cue))[np.isfinite(log_depth) & np.isfinite(cue)]
+            usual = np.log(raw) + np.float32(np.median(known) if known.size else np.nan)
             blended = np.where(np.isfinite(blended), blended, usual)
         return np.exp(np.where(np.isfinite(raw), blended, np.float32(np.nan)))
 
