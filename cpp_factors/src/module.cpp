@@ -16,8 +16,8 @@ NB_MODULE(_core, module) {
   module.doc() = "C++ factors and linear solvers for uni4d_fg.";
   // Objects that outlive the interpreter's own clean-up (in a failed test, say) are no reason to print.
   nb::set_leak_warnings(false);
-  // Raised by every change of a signature or of a meaning.
-  module.attr("ABI") = 2;
+  // Raised by every new entry point and every change of a signature or of a meaning.
+  module.attr("ABI") = 3;
   uni4d_fg::bind_factor_types(module);
   uni4d_fg::bind_whitening(module);
   uni4d_fg::bind_pair_system(module);

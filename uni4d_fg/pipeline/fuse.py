@@ -70,14 +70,14 @@ def fuse_depth(
         Cancelled: If ``should_stop`` said so; nothing is left behind.
         OutputError: If the file cannot be written.
     """
-    core, _ = find_extension()
+    core, reason = find_extension()
     unmatched = "" if config.multiview.enabled else "is switched off"
     if config.multiview.enabled and not lens.is_pinhole:
         unmatched = "is not made of distorted images"
     elif config.multiview.enabled and zoom is not None:
         unmatched = "is not made of frames that zoom"
-    elif config.multiview.enabled and not hasattr(core, "plane_sweep"):
-        unmatched = f"needs the C++ extension: {INSTALL_COMMAND}"
+    elif config.multiview.enabled and core is None:
+        unmatched = f"is left out, as {reason}: run `{INSTALL_COMMAND}`"
     control = [control_points(labelled, scene, motion, frame) for frame in range(sequence.num_frames)]
     broken = contradicting_frames(control, config)
     intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)

@@ -77,8 +77,8 @@ def test_what_is_marked_moving_is_not_matched() -> None:
 
 def test_cpp_and_numpy_agree(rng: np.random.Generator) -> None:
     core, reason = find_extension()
-    if core is None or not hasattr(core, "plane_sweep"):
-        pytest.skip(reason or "the extension has no plane sweep")
+    if core is None:
+        pytest.skip(reason)
     poses = [at(0.1, 0.02, 0.05), at(-0.12), at(0.02, -0.1)]
     image = view(at(0.0))[0]
     image[10:14, 10:20] = np.nan
@@ -107,8 +107,8 @@ def test_cpp_and_numpy_agree(rng: np.random.Generator) -> None:
 
 def test_bad_input_is_named() -> None:
     core, reason = find_extension()
-    if core is None or not hasattr(core, "plane_sweep"):
-        pytest.skip(reason or "the extension has no plane sweep")
+    if core is None:
+        pytest.skip(reason)
     image = np.zeros((20, 20))
     with pytest.raises(ValueError, match="others"):
         core.plane_sweep(

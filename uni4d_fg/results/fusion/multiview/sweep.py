@@ -1,4 +1,4 @@
-"""Plane sweep with semi-global aggregation, in C++ where the extension has it and in NumPy elsewhere."""
+"""Plane sweep with semi-global aggregation, in C++ where the extension is installed and in NumPy elsewhere."""
 
 from __future__ import annotations
 
@@ -52,7 +52,6 @@ def sweep(
     turns = np.stack([camera @ pose[:3, :3] @ np.linalg.inv(camera) for pose in other_T_cam])
     shifts = np.stack([camera @ pose[:3, 3] for pose in other_T_cam])
     core, _ = find_extension()
-    run: Any = getattr(core, "plane_sweep", None)
     settings: dict[str, Any] = {
         "radius": config.window_radius_px,
         "noise": config.image_noise,
@@ -60,10 +59,10 @@ def sweep(
         "large_step": config.large_step_penalty,
         "edge_contrast": config.edge_contrast,
     }
-    if run is None:
+    if core is None:
         plane, cost, rival, match = sweep_numpy(image, np.stack(others), turns, shifts, planes, **settings)
     else:
-        plane, cost, rival, match = run(
+        plane, cost, rival, match = core.plane_sweep(
             np.ascontiguousarray(image, dtype=np.float64), np.stack(others).astype(np.float64),
             np.ascontiguousarray(turns), np.ascontiguousarray(shifts), np.ascontiguousarray(planes), threads=threads,
             **settings,
