@@ -29,7 +29,7 @@ from uni4d_fg.pipeline.stream import stream_sequence
 pytest.importorskip("open3d")
 
 PROGRAMS = Path(__file__).parents[1] / "pipeline"
-ENTRY = [sys.executable, "-m", "uni4d_fg.cli.entry"]
+ENTRY = [sys.executable, "-m", "uni4d_fg"]
 QUIET = ["output.clouds=false", "output.pictures=false"]
 
 

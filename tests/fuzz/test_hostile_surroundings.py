@@ -17,7 +17,7 @@ from uni4d_fg import optional
 from uni4d_fg.cli.failures import known_error
 from uni4d_fg.errors import Cancelled, InputError, OutputError
 
-ENTRY = [sys.executable, "-m", "uni4d_fg.cli.entry"]
+ENTRY = [sys.executable, "-m", "uni4d_fg"]
 
 
 def run(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -35,7 +35,7 @@ def test_a_full_standard_output() -> None:
 
 def test_a_reader_that_goes_away() -> None:
     done = subprocess.run(
-        ["bash", "-c", f"{sys.executable} -m uni4d_fg.cli.entry config --all | head -n 1"],
+        ["bash", "-c", f"{sys.executable} -m uni4d_fg config --all | head -n 1"],
         capture_output=True,
         text=True,
         timeout=60,
@@ -46,7 +46,7 @@ def test_a_reader_that_goes_away() -> None:
 
 @pytest.mark.parametrize("closed", ["2>&-", ">&-", ">&- 2>&-", "<&-"])
 def test_closed_streams(closed: str) -> None:
-    command = f"{sys.executable} -m uni4d_fg.cli.entry config --set nosuch=1 {closed}"
+    command = f"{sys.executable} -m uni4d_fg config --set nosuch=1 {closed}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
@@ -54,7 +54,7 @@ def test_closed_streams(closed: str) -> None:
 
 def test_a_working_directory_that_is_gone(tmp_path: Path) -> None:
     (tmp_path / "gone").mkdir()
-    command = f"cd {tmp_path}/gone && rmdir {tmp_path}/gone && {sys.executable} -m uni4d_fg.cli.entry validate seq"
+    command = f"cd {tmp_path}/gone && rmdir {tmp_path}/gone && {sys.executable} -m uni4d_fg validate seq"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 3, done.stderr
     assert "working directory no longer exists" in done.stderr
