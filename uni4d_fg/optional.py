@@ -59,6 +59,11 @@ def import_rerun() -> Any:
     return _import_extra("rerun", "export", "the format rrd needs")
 
 
+def import_pygltflib() -> Any:
+    """Return ``pygltflib``, which writes glTF scenes. Raises MissingDependencyError."""
+    return _import_extra("pygltflib", "export", "the format glb needs")
+
+
 def import_pooch() -> Any:
     """Return ``pooch``, which downloads files. Raises MissingDependencyError."""
     return _import_extra("pooch", "models", "fetching a model needs")

@@ -21,9 +21,12 @@ class FormatChoice(str, Enum):
 
     colmap = "colmap"
     nerfstudio = "nerfstudio"
+    gsplat = "gsplat"
     tum = "tum"
     kitti = "kitti"
     ply = "ply"
+    ply_frames = "ply-frames"
+    glb = "glb"
     rrd = "rrd"
     uni4d = "uni4d"
 
@@ -35,9 +38,10 @@ def export(
         Path | None, typer.Option(help="Folder that gets one folder per format; RUN/export if not given.")
     ] = None,
     sequence: Annotated[Path | None, typer.Option(help="The run's sequence, if it was moved.")] = None,
-    masks: Annotated[bool, typer.Option(help="colmap, nerfstudio: masks that hide what moves.")] = True,
-    depth: Annotated[bool, typer.Option("--depth", help="colmap, nerfstudio: dense depth too.")] = False,
-    text: Annotated[bool, typer.Option(help="colmap: the model as text too.")] = True,
+    masks: Annotated[bool, typer.Option(help="colmap, nerfstudio, gsplat: hide what moves.")] = True,
+    depth: Annotated[bool, typer.Option("--depth", help="colmap, nerfstudio, gsplat: dense depth too.")] = False,
+    normals: Annotated[bool, typer.Option("--normals", help="nerfstudio: normals of the dense depth too.")] = False,
+    text: Annotated[bool, typer.Option(help="colmap, gsplat: the model as text too.")] = True,
     trajectories: Annotated[bool, typer.Option("--trajectories", help="ply: trajectories, camera path too.")] = False,
     undistort: Annotated[
         bool, typer.Option("--undistort", help="Frames, masks and depth without lens distortion, with a pinhole.")
@@ -60,7 +64,13 @@ def export(
         return (stored if sequence is None else replace(stored, root=str(sequence.resolve()))).read()
 
     choices = ExportOptions(
-        masks=masks, depth=depth, text=text, trajectories=trajectories, trail=trail, undistort=undistort
+        masks=masks,
+        depth=depth,
+        normals=normals,
+        text=text,
+        trajectories=trajectories,
+        trail=trail,
+        undistort=undistort or normals,
     )
     with progress_reporter(quiet or json) as reporter, Interruption() as stop:
         reports = export_run(

@@ -16,15 +16,18 @@ from uni4d_fg.reading import check_regular
 from uni4d_fg.results.run_folder import RunFolder
 
 _MAX_PLY_HEADER = 4096
+_PLAIN_BYTES, _NORMAL_BYTES = 3 * 4 + 3, 3 * 4
+"""Of a point with its color, and of its normal."""
 
 
-def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
+def write_ply(path: Path, points: FloatArray, colors: ImageArray, normals: FloatArray | None = None) -> None:
     """Write a colored cloud as binary PLY, whole or not at all; an empty cloud gives a file without points.
 
     Args:
         path: The ``.ply`` file.
         points: (N, 3) world positions, meters, finite.
         colors: (N, 3) RGB.
+        normals: (N, 3) unit vectors in world axes, finite; none are written if None.
 
     Raises:
         OutputError: If the arrays are no cloud, or the file cannot be written.
@@ -34,16 +37,21 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray) -> None:
         raise OutputError(f"{path}: points {points.shape} and colors {colors.shape} must both be (N, 3)")
     if not np.isfinite(points).all():
         raise OutputError(f"{path}: a point is NaN or infinite")
+    if normals is not None and (normals.shape != points.shape or not np.isfinite(normals).all()):
+        raise OutputError(f"{path}: normals {normals.shape} must be finite and as many as points {points.shape}")
     if len(points) == 0:
-        _write_empty(path)
+        _write_empty(path, with_normals=normals is not None)
         return
     open3d = import_open3d()
     cloud = open3d.t.geometry.PointCloud()
     cloud.point.positions = open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
     cloud.point.colors = open3d.core.Tensor(np.ascontiguousarray(colors, dtype=np.uint8))
+    if normals is not None:
+        cloud.point.normals = open3d.core.Tensor(np.ascontiguousarray(normals, dtype=np.float32))
+    size = len(points) * (_PLAIN_BYTES + (_NORMAL_BYTES if normals is not None else 0))
     quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
     with atomic_path(path) as temporary, quiet:
-        if not open3d.t.io.write_point_cloud(str(temporary), cloud) or not _is_whole(temporary, len(points)):
+        if not open3d.t.io.write_point_cloud(str(temporary), cloud) or not _is_whole(temporary, size):
             raise OutputError(f"cannot write {path}: Open3D failed; check free space and the folder's permissions")
 
 
@@ -98,15 +106,16 @@ def write_clouds(
     return count
 
 
-def _is_whole(path: Path, count: int) -> bool:
-    """Tell whether a PLY of ``count`` colored points is complete: Open3D does not notice a full disk."""
+def _is_whole(path: Path, size: int) -> bool:
+    """Tell whether ``size`` bytes follow a PLY's header: Open3D does not notice a full disk."""
     content = path.read_bytes()
     header, found, _ = content.partition(b"end_header\n")
-    return bool(found) and len(content) - len(header) - len(found) == count * (3 * 4 + 3)
+    return bool(found) and len(content) - len(header) - len(found) == size
 
 
-def _write_empty(path: Path) -> None:
-    coordinates = "".join(f"property float {axis}\n" for axis in "xyz")
+def _write_empty(path: Path, *, with_normals: bool) -> None:
+    axes = ("x", "y", "z", *(("nx", "ny", "nz") if with_normals else ()))
+    coordinates = "".join(f"property float {axis}\n" for axis in axes)
     channels = "".join(f"property uchar {channel}\n" for channel in ("red", "green", "blue"))
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 0\n" + coordinates + channels + "end_header\n"
     with atomic_path(path) as temporary:

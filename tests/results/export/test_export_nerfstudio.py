@@ -116,3 +116,31 @@ def test_dense_depth_of_a_run_without_it_is_refused(source: Run, tmp_path: Path)
     with pytest.raises(InputError, match="needs dense depth"):
         export_run(bare, ["nerfstudio"], tmp_path / "out", ExportOptions(depth=True))
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_zoom_has_no_focal_length_of_the_whole_video(source: Run, tmp_path: Path) -> None:
+    zoom = np.linspace(1.0, 1.3, source.num_frames)
+    zoomed = dataclasses.replace(source.reconstruction, zoom=zoom)
+    export_run(source.with_parts(reconstruction=zoomed), ["nerfstudio"], tmp_path)
+    meta = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())
+    # nerfstudio reads focal lengths of frames only where the file has none for all.
+    assert "fl_x" not in meta
+    assert "fl_y" not in meta
+    np.testing.assert_allclose([frame["fl_x"] for frame in meta["frames"]], zoomed.intrinsics[0] * zoom)
+
+
+def test_normals_are_where_and_as_dn_splatter_reads_them(source: Run, exported: Export) -> None:
+    folder, _ = exported("nerfstudio", normals=True)
+    meta = json.loads((folder / "transforms.json").read_text())
+    # One file per image, in the same order: its frames are chosen by number.
+    stems = [Path(entry["file_path"]).stem for entry in meta["frames"]]
+    assert sorted(path.stem for path in (folder / "normals_from_pretrain").glob("*.png")) == stems
+    for frame, stem in enumerate(stems):
+        colors = read_image(folder / "normals_from_pretrain" / f"{stem}.png")
+        normals = colors.astype(float) / 255 * 2 - 1
+        known = np.isfinite(source.depth[frame])  # type: ignore[index]
+        known &= np.abs(np.linalg.norm(normals, axis=2) - 1) < 0.02
+        assert known.mean() > 0.7
+        v, u = np.nonzero(known)
+        rays_in_camera = rays(meta, np.eye(4), u.astype(float), v.astype(float))
+        assert ((rays_in_camera * normals[known]).sum(axis=1) < 0.02).all()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from uni4d_fg.errors import OutputError
+from uni4d_fg.results.clouds import write_ply
 from uni4d_fg.results.export import export_run
 from uni4d_fg.results.export.line_set import LineSet, write_line_set
 from uni4d_fg.results.run import Run
@@ -88,3 +91,41 @@ def test_vertex_attributes_come_back(tmp_path: Path) -> None:
     lines = open3d.io.read_line_set(str(tmp_path / "l.ply"))
     np.testing.assert_array_equal(np.asarray(lines.points), points)
     np.testing.assert_array_equal(np.asarray(lines.lines), [[0, 1], [2, 3]])
+
+
+def test_frames_have_a_point_for_every_moving_pixel_with_normals(source: Run, exported: Export) -> None:
+    folder, _ = exported("ply-frames")
+    result, (fx, fy, cx, cy) = source.reconstruction, source.reconstruction.intrinsics
+    _, width = result.image_size
+    stems = sorted(path.stem for path in (folder / "frames").iterdir())
+    assert stems == [f"{frame:05d}" for frame in range(source.num_frames)]
+    for frame, pose in enumerate(result.world_T_cam):
+        cloud = open3d.io.read_point_cloud(str(folder / "frames" / f"{frame:05d}.ply"))
+        points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+        x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+        u, v = np.rint(fx * x / z + cx).astype(int), np.rint(fy * y / z + cy).astype(int)
+        mask, depth = source.need_sequence().masks[frame] > 0, source.depth[frame]  # type: ignore[index]
+        assert len(np.unique(v * width + u)) == len(points)
+        assert mask[v, u].all()
+        np.testing.assert_allclose(z, depth[v, u], atol=1e-4)
+        # Only depth edges are left out.
+        assert len(points) > 0.6 * (mask & np.isfinite(depth)).sum() > 10
+        np.testing.assert_array_equal(
+            np.rint(np.asarray(cloud.colors) * 255), source.need_sequence().images[frame][v, u]
+        )
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-4)
+        assert ((normals * (pose[:3, 3] - points)).sum(axis=1) > 0).all()
+    np.testing.assert_allclose(np.loadtxt(folder / "times.txt"), result.timestamps - result.timestamps[0], atol=1e-8)
+    assert open3d.io.read_point_cloud(str(folder / "static.ply")).has_normals()
+
+
+def test_an_empty_cloud_has_the_same_properties(tmp_path: Path) -> None:
+    none = np.zeros((0, 3))
+    write_ply(tmp_path / "none.ply", none, none.astype(np.uint8), none)
+    write_ply(tmp_path / "one.ply", np.ones((1, 3)), np.ones((1, 3), np.uint8), np.eye(3)[:1])
+    headers = [
+        re.findall(rb"property (?:\w+ )+(\w+)", (tmp_path / name).read_bytes()) for name in ("none.ply", "one.ply")
+    ]
+    assert headers[0] == headers[1]
+    with pytest.raises(OutputError, match="normals"):
+        write_ply(tmp_path / "bad.ply", np.ones((2, 3)), np.ones((2, 3), np.uint8), np.ones((1, 3)))

@@ -25,12 +25,13 @@ _COPIED_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def encode(image: npt.NDArray[Any], suffix: str, path: Path) -> bytes:
-    """Return an image (RGB, or one channel) as the bytes of a ``.png`` or ``.jpg`` file.
+    """Return an image (RGB, RGBA, or one channel) as the bytes of a ``.png`` or ``.jpg`` file.
 
     Raises:
         OutputError: If it cannot be encoded; ``path`` is named.
     """
-    pixels = np.ascontiguousarray(image[:, :, ::-1]) if image.ndim == 3 else image
+    # OpenCV's order: blue first, alpha last.
+    pixels = np.ascontiguousarray(image[:, :, [2, 1, 0, 3][: image.shape[2]]]) if image.ndim == 3 else image
     flags = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
     encoded, data = cv2.imencode(suffix, pixels, flags)
     if not encoded:

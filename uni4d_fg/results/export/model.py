@@ -16,11 +16,13 @@ class ExportOptions:
     """Choices that some formats offer; a format to which one means nothing ignores it."""
 
     masks: bool = True
-    """colmap, nerfstudio: write masks that hide what moves (where the sequence has any)."""
+    """colmap, nerfstudio, gsplat: hide what moves (where the sequence has any masks)."""
     depth: bool = False
-    """colmap, nerfstudio: write the dense depth."""
+    """colmap, nerfstudio, gsplat: write the dense depth."""
+    normals: bool = False
+    """nerfstudio: write normals of the dense depth; the images are undistorted."""
     text: bool = True
-    """colmap: write the model as text beside the binary one."""
+    """colmap, gsplat: write the model as text beside the binary one."""
     trajectories: bool = False
     """ply: write the trajectories of moving points and the camera path as line sets."""
     undistort: bool = False

@@ -17,10 +17,13 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.files import atomic_write_json
 from uni4d_fg.results.clouds import write_ply
 from uni4d_fg.results.export.clouds import static_cloud
-from uni4d_fg.results.export.frames import MAX_PNG_DEPTH, depth_png, write_images, write_masks
+from uni4d_fg.results.export.frames import MAX_PNG_DEPTH, depth_png, encode, write_images, write_masks
 from uni4d_fg.results.export.model import ExportJob
+from uni4d_fg.results.normals import normal_colors, normal_map
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+NORMALS = "normals_from_pretrain"
+"""The folder in which DN-Splatter, an extension of nerfstudio, looks for normals."""
 
 
 def opengl_poses(world_T_cam: FloatArray) -> FloatArray:
@@ -63,15 +66,34 @@ def write_nerfstudio(job: ExportJob) -> None:
     fx, fy, cx, cy = result.intrinsics.tolist()
     height, width = result.image_size
     names_of_lens = ("k1", "k2", "k3", "k4") if result.lens.is_fisheye else ("k1", "k2", "p1", "p2")
-    camera = {
+    camera: dict[str, Any] = {
         "camera_model": "OPENCV_FISHEYE" if result.lens.is_fisheye else "OPENCV",
         "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "w": width, "h": height,
         **dict(zip(names_of_lens, result.lens.padded.tolist(), strict=True)),
     }  # fmt: skip
+    if result.zoom is not None:
+        # Where the whole video has a focal length, nerfstudio does not look for those of its frames.
+        del camera["fl_x"], camera["fl_y"]
+    if job.options.normals:
+        _write_normals(job, job.folder / NORMALS, stems)
     atomic_write_json(
         job.folder / "transforms.json", camera | meta | {"ply_file_path": "sparse_pc.ply", "frames": frames}
     )
     job.figures |= {"images": len(names), "points": len(cloud.points)}
+
+
+def _write_normals(job: ExportJob, folder: Path, stems: list[str]) -> None:
+    depths, result = job.run.need_depth("--normals"), job.run.reconstruction
+    folder.mkdir()
+    flip = np.diag(OPENGL_FROM_OPENCV)[:3].astype(np.float32)
+    for frame, (stem, depth) in enumerate(zip(stems, depths, strict=True)):
+        path = folder / f"{stem}.png"
+        normals = normal_map(depth, result.frame_intrinsics[frame]) * flip
+        path.write_bytes(encode(normal_colors(normals), ".png", path))
+        job.check()
+    job.facts.append(
+        f"{NORMALS}/: normals in OpenGL's camera axes, (n + 1) / 2 as 8-bit RGB, as DN-Splatter reads them"
+    )
 
 
 def _write_depth(job: ExportJob, folder: Path, stems: list[str], frames: list[dict[str, Any]]) -> None:
