@@ -109,6 +109,20 @@ WindowFrames = Annotated[
 WindowOverlap = Annotated[
     int | None, typer.Option("--overlap", help="Frames that a window shares with the next.", min=2)
 ]
+WindowProcesses = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", help="Solve this many windows at once, each in its own process; 1: in this one, same result.",
+        show_default=False,
+    ),
+]  # fmt: skip
+WindowScheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler of a cluster that solves the windows.",
+        show_default=False,
+    ),
+]  # fmt: skip
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a run; finished stages are kept.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from uni4d_fg.frontend.sequence.model import Sequence, Video
     from uni4d_fg.pipeline import RunSummary
     from uni4d_fg.pipeline.measurements import MeasurementFiles
+    from uni4d_fg.pipeline.workers.options import WorkerOptions
 
 
 def reconstruct(
@@ -37,6 +38,8 @@ def reconstruct(
     solver: options.Solver = None,
     window: options.WindowFrames = None,
     overlap: options.WindowOverlap = None,
+    workers: options.WindowProcesses = None,
+    scheduler: options.WindowScheduler = None,
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     start: options.Start = 0,
@@ -75,6 +78,7 @@ def reconstruct(
     from uni4d_fg.frontend.measurements.imu import read_imu
     from uni4d_fg.pipeline.inertial import check_goes_with_imu
     from uni4d_fg.pipeline.measurements import MeasurementFiles
+    from uni4d_fg.pipeline.workers.options import WorkerOptions
     from uni4d_fg.slam.windows.plan import windows_of
 
     began = time.perf_counter()
@@ -82,6 +86,9 @@ def reconstruct(
     chosen += [] if window is None else [f"windows.frames={window}"]
     chosen += [] if overlap is None else [f"windows.overlap={overlap}"]
     settings = load_config(config, [*(changes or ()), *chosen])
+    work = None if workers is None and scheduler is None else WorkerOptions(workers, scheduler)
+    if work is not None and settings.windows.frames is None:
+        raise ConfigError("--workers and --scheduler are for the windows of a long video: add --window N")
     source = SequenceInput.of(
         seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics,
         intrinsics=intrinsics, start=start, stop=stop, stride=stride, max_size=max_size, depth_model=depth_model,
@@ -106,7 +113,7 @@ def reconstruct(
         chosen = settings if report is None or report.settings is None else report.settings
         return run_pipeline(
             sequence, folder, chosen, resume=again, quiet=quiet, cues=report, measurements=files, imu=samples,
-            warnings=warnings, forecast=forecast,
+            warnings=warnings, forecast=forecast, workers=work,
         ), sequence  # fmt: skip
 
     with run_lock(run):
@@ -218,6 +225,7 @@ def run_pipeline(
     sequence: Sequence, run: Path, config: Config, *, resume: bool, quiet: bool, cues: CueReport | None = None,
     imu: ImuSamples | None = None,
     measurements: MeasurementFiles | None = None, warnings: tuple[str, ...] = (), forecast: Forecast | None = None,
+    workers: WorkerOptions | None = None,
 ) -> RunSummary:  # fmt: skip
     """Reconstruct with progress; Ctrl-C ends the run cleanly and says how to go on.
 
@@ -231,7 +239,7 @@ def run_pipeline(
             return reconstruct_sequence(
                 sequence, run, config, resume=resume, reporter=reporter, should_stop=stop,
                 cues=None if cues is None else cues.to_dict(), measurements=measurements, imu=imu,
-                warnings=warnings,
+                warnings=warnings, workers=workers,
             )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"finished stages are kept in {run}; continue with: {resume_command()}") from error

@@ -14,6 +14,7 @@ all go by what is declared here.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -101,6 +102,10 @@ class FactorType:
     def __repr__(self) -> str:
         return f"FactorType({self.name!r})"
 
+    def __reduce__(self) -> Any:
+        # By name, as variable types are: what it was declared with stands in the module under its name.
+        return (_listed, (self.name, self.residual.__module__)) if self.listed else super().__reduce__()
+
     def __call__(
         self,
         *rows: IntArray | int,
@@ -187,6 +192,12 @@ def factor(
         )
 
     return declare
+
+
+def _listed(name: str, module: str) -> FactorType:
+    """Return the factor type of a name, in a process that may not have loaded its module yet."""
+    importlib.import_module(module)
+    return _LISTED[name]
 
 
 def factor_types() -> tuple[FactorType, ...]:

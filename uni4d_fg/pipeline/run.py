@@ -14,7 +14,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
-from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.bars import bars_note, without_bars
@@ -43,7 +43,9 @@ from uni4d_fg.pipeline.repeats import Repeats
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
+from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
+from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.labels_io import load_labels, save_labels
@@ -71,6 +73,8 @@ class _Run:
     sources: tuple[FactorSource, ...]
     """What is added to the stages."""
     imu: ImuSamples | None = None
+    workers: WorkerOptions | None = None
+    """Where windows are solved; None: here, with all threads."""
 
     def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord], total: int | None = None) -> Arrays:
         """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored.
@@ -133,6 +137,7 @@ def reconstruct(
     measurements: MeasurementFiles | None = None,
     imu: ImuSamples | None = None,
     warnings: Iterable[str] = (),
+    workers: WorkerOptions | None = None,
 ) -> RunSummary:
     """Reconstruct a sequence and write the run folder.
 
@@ -150,6 +155,8 @@ def reconstruct(
         measurements: Files of odometry, GPS and relative poses that join bundle adjustment; ``resume`` compares them.
         imu: Inertial measurements over all frames, on their clock, for stage 2.
         warnings: What else the summary should warn of.
+        workers: Processes that solve the windows of a long video; with ``workers=1`` it is this one, with the same
+            result to the last bit.
 
     Returns:
         The summary that is also written as ``summary.json``.
@@ -157,7 +164,7 @@ def reconstruct(
     Raises:
         InputError: If a cue cannot be read, the parts of the sequence contradict each other, or the IMU does not cover
             the frames.
-        ConfigError: If the configuration leaves no place for an IMU.
+        ConfigError: If the configuration leaves no place for an IMU, or has no windows for workers.
         DegenerateProblemError: If the cues do not determine the cameras, or the IMU not the scale.
         SolverError: If a stage cannot be solved.
         OutputError: If a result cannot be written.
@@ -170,7 +177,7 @@ def reconstruct(
         mark_run(run_dir)
         return _reconstruct(
             recorder, sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False),
-            cues or {}, additions, measurements or MeasurementFiles(), imu, warnings,
+            cues or {}, additions, measurements or MeasurementFiles(), imu, warnings, workers,
         )  # fmt: skip
 
 
@@ -178,7 +185,10 @@ def _reconstruct(
     recorder: RecordingRunner, sequence: Sequence, run_dir: Path, config: Config, resume: bool, reporter: Reporter,
     should_stop: Callable[[], bool], cues: dict[str, Any], additions: Iterable[FactorSource],
     measurements: MeasurementFiles, imu: ImuSamples | None, warnings: Iterable[str],
+    workers: WorkerOptions | None,
 ) -> RunSummary:  # fmt: skip
+    if workers is not None and config.windows.frames is None:
+        raise ConfigError("workers solve the windows of a long video: set windows.frames (`--window N`)")
     measured = read_measurements(measurements, sequence.timestamps, config.measurements)
     sources = (*additions, *measured.sources)
     run_stage = with_additions(recorder, sources)
@@ -202,7 +212,7 @@ def _reconstruct(
     )
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter, should_stop, summary, recorder, sources, imu,
+        reporter, should_stop, summary, recorder, sources, imu, workers,
     )  # fmt: skip
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
@@ -275,16 +285,22 @@ def _stages(
         if config.joint.enabled:
             run.summary.warnings.append(NOT_IN_WINDOWS)
         _forget(run, "joint")
-        parts = WindowedRun(
-            sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
-            run.reporter, run.should_stop,
-        )  # fmt: skip
         key = stage_key(key, config.bundle_adjustment, config.windows, *fingerprints(run.sources))
         before = key
-        scene = run.step("bundle_adjustment", key, lambda hooks: scene_step(parts, before, hooks))
-        key = stage_key(key, config.nonrigid, *_searched(config))
-        after = key
-        return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
+        if run.workers is not None and run.sources:
+            run.summary.warnings.append(NOT_ON_WORKERS)
+        with window_workers(
+            run.workers, windows, sequence.image_size, run.store.folder / "windows", config, run.recorder,
+            run.should_stop, alone=bool(run.sources),
+        ) as workers:  # fmt: skip
+            parts = WindowedRun(
+                sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
+                run.reporter, run.should_stop, workers,
+            )  # fmt: skip
+            scene = run.step("bundle_adjustment", key, lambda hooks: scene_step(parts, before, hooks))
+            key = stage_key(key, config.nonrigid, *_searched(config))
+            after = key
+            return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
     inertial = [] if run.imu is None else [config.imu, run.imu.digest()]
     key = stage_key(key, config.bundle_adjustment, *inertial, *fingerprints(run.sources))

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.counted import counted
-from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.optim.added_factors import AddingRunner
@@ -21,29 +21,35 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.fingerprint import stage_key
 from uni4d_fg.pipeline.rigid import NOT_IN_WINDOWS
-from uni4d_fg.pipeline.steps import Arrays, bundle_summary, given_poses, nonrigid_step, stop_if_cancelled
+from uni4d_fg.pipeline.steps import Arrays, bundle_summary, given_poses, stop_if_cancelled
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import solve_dict
+from uni4d_fg.pipeline.window_tasks import (
+    STOPPED,
+    InformationItem,
+    LandmarksItem,
+    MadeItems,
+    MotionItem,
+    Place,
+    SceneItem,
+    scene_part,
+    solve_window_motion,
+    solve_window_scene,
+    window_information,
+    window_landmarks,
+)
+from uni4d_fg.pipeline.window_workers import InOrder, SolveEach, WindowWorkers
 from uni4d_fg.progress import Reporter
 from uni4d_fg.slam.stages.bundle_adjustment import hold_metric_scale
 from uni4d_fg.slam.stages.scene import Cameras, unknown_covariances
 from uni4d_fg.slam.windows.added_terms import added_terms
 from uni4d_fg.slam.windows.join import Joined, chain, join
 from uni4d_fg.slam.windows.motion import join_motion
-from uni4d_fg.slam.windows.numbered import NumberedRunner
 from uni4d_fg.slam.windows.plan import TrackSpans, Window, blend_weight, tracks_in
-from uni4d_fg.slam.windows.scene import (
-    WindowLandmarks,
-    WindowScene,
-    calibrate,
-    finish,
-    information,
-    owned,
-    place,
-    solve_scene,
-)
+from uni4d_fg.slam.windows.scene import WindowLandmarks, calibrate
 
-_STOPPED = "stopped; finished windows are kept, --resume continues from them"
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True)
@@ -60,24 +66,50 @@ class WindowedRun:
     run: StageRunner
     reporter: Reporter
     should_stop: Callable[[], bool]
+    workers: WindowWorkers | None = None
+    """Where windows are solved at once; None: one after the other in this process."""
 
-    def record(self, name: str, window: Window, key: str, compute: Callable[[], StageRecord]) -> StageRecord:
-        """Return one window's record: the stored one of the same key when resuming, else computed and stored.
+    def solve_each(self, hooks: Hooks) -> SolveEach:
+        """Return what solves independent windows."""
+        return self.workers or InOrder(self.run, hooks)
+
+    def records(
+        self, name: str, keys: list[str], make: Callable[[int, Place], ItemT],
+        solve: Callable[[ItemT, StageRunner, Hooks], None], hooks: Hooks,
+    ) -> list[Place]:  # fmt: skip
+        """Make sure that every window has its record: the stored one of the same key when resuming, else a new one.
 
         The last window is always solved: its factor graph is that of the step, and not part of the record.
 
+        Args:
+            name: Of the records.
+            keys: Of the windows.
+            make: Returns what a window is solved from.
+            solve: Solves it and writes its record.
+            hooks: Progress and cancellation.
+
         Raises:
             Cancelled: If the user interrupts; finished windows are kept.
-            OutputError: If it cannot be written.
+            OutputError: If a record cannot be written.
         """
-        file = f"{name}_{window.start:06d}"
-        found = self.store.load(file, key) if self.resume and window is not self.windows[-1] else None
-        if found is None:
-            self.check_cancelled()
-            found = compute()
-            self.store.save(file, key, found)
-        self.reporter.advance(window.stop, f"frames {window} of {self.windows[-1].stop}")
-        return found
+        windows = self.windows
+        places = [
+            Place(self.store, f"{name}_{window.start:06d}", key, window)
+            for window, key in zip(windows, keys, strict=True)
+        ]
+        last = len(windows) - 1
+        left = [
+            index
+            for index, found in enumerate(places)
+            if not (self.resume and index < last and self.store.load(found.file, found.key) is not None)
+        ]
+        items = MadeItems(left, lambda index: make(index, places[index]))
+        done = sum(len(window) for index, window in enumerate(windows) if index not in left)
+        for index, _ in self.solve_each(hooks)(solve, items):
+            window = windows[left[index]]
+            done += len(window)
+            self.reporter.advance(done, f"frames {window} of {windows[-1].stop}")
+        return places
 
     def check_cancelled(self) -> None:
         """Stop if the user asked for it.
@@ -86,42 +118,27 @@ class WindowedRun:
             Cancelled: Then.
         """
         if self.should_stop():
-            raise Cancelled("stopped; finished windows are kept, --resume continues from them")
+            raise Cancelled(STOPPED)
 
 
 def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
     """Solve stages 1 and 2 window by window and join them."""
     config, windows, labelled = windowed.config, windowed.windows, windowed.labelled
-    keys, dropped, initial = [], Counter[str](), given_poses(windowed.sequence, config)
+    dropped, initial = Counter[str](), given_poses(windowed.sequence, config)
     key, intrinsics, intrinsics_covariance, solves = _calibration(windowed, key, hooks)
-    for window in windows:
-        key = stage_key(key, [window.start, window.stop])
 
-        def compute(window: Window = window) -> StageRecord:
-            scene, done, lost = solve_scene(
-                tracks_in(labelled, window.frames), window, intrinsics, intrinsics, initial, config, hooks,
-                windowed.run, timestamps=windowed.sequence.timestamps,
-            )  # fmt: skip
-            stop_if_cancelled(done, _STOPPED)
-            return StageRecord(scene.arrays(), {"solves": [solve_dict(s) for s in done], "dropped": lost})
+    def item(index: int, place: Place) -> SceneItem:
+        tracks = tracks_in(labelled, windows[index].frames)
+        return SceneItem(place, tracks, intrinsics, initial, windowed.sequence.timestamps, config)
 
-        found = windowed.record("scene", window, key, compute)
-        keys.append(key)
-        solves += found.summary["solves"]
-        dropped.update(found.summary["dropped"])
-
-    def scene_of(index: int) -> WindowScene:
-        record = windowed.store.load(f"scene_{windows[index].start:06d}", keys[index])
-        if record is None:
-            raise InputError(f"{windowed.store.folder}: the record of frames {windows[index]} is gone; start again")
-        return WindowScene.of_arrays(windows[index], record.arrays)
-
-    joined = _join(windowed, scene_of, intrinsics_covariance)
-    cameras = joined.cameras
-    parts = []
-    for index in range(len(windows)):
-        windowed.check_cancelled()
-        parts.append(finish(scene_of(index), cameras, config.bundle_adjustment, windowed.run))
+    places = windowed.records("scene", _keys(key, windows), item, solve_window_scene, hooks)
+    for place in places:
+        told = place.load().summary
+        solves += told["solves"]
+        dropped.update(told["dropped"])
+    joined = _join(windowed, places, intrinsics_covariance, hooks)
+    items = MadeItems(range(len(windows)), lambda i: LandmarksItem(places[i], joined.cameras, config))
+    parts = _in_order(windowed.solve_each(hooks)(window_landmarks, items))
     solves += [solve_dict(s) for part in parts for s in part.solves]
     dropped["landmark far from its neighbors"] = sum(part.dropped for part in parts)
     arrays = _joined_arrays(windows, joined, parts)
@@ -132,24 +149,33 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
 
 def motion_step(windowed: WindowedRun, scene: Arrays, key: str, hooks: Hooks) -> StageRecord:
     """Solve stage 3 window by window and blend the trajectories where windows overlap."""
-    records = []
-    for window in windowed.windows:
-        key = stage_key(key, [window.start, window.stop])
+    windows = windowed.windows
 
-        def compute(window: Window = window) -> StageRecord:
-            here = tracks_in(windowed.labelled, window.frames)
-            run = NumberedRunner(windowed.run, window.frames, here.track, own_world=False)
-            record = nonrigid_step(here.labelled, _scene_part(scene, window, here.track), windowed.config, hooks, run)
-            arrays = {**record.arrays, "track": here.track[record.arrays["track"]]}
-            return StageRecord(arrays, record.summary)
+    def item(index: int, place: Place) -> MotionItem:
+        here = tracks_in(windowed.labelled, windows[index].frames)
+        return MotionItem(place, here, scene_part(scene, windows[index], here.track), windowed.config)
 
-        records.append(windowed.record("motion", window, key, compute))
-    weights = [blend_weight(windowed.windows, i) for i in range(len(windowed.windows))]
-    arrays = join_motion(windowed.windows, weights, [record.arrays for record in records])
+    places = windowed.records("motion", _keys(key, windows), item, solve_window_motion, hooks)
+    records = [place.load() for place in places]
+    weights = [blend_weight(windows, i) for i in range(len(windows))]
+    arrays = join_motion(windows, weights, [record.arrays for record in records])
     summary = _joined_summary(arrays, [record.summary for record in records])
     if windowed.config.rigid_objects.enabled:
         summary["facts"].append(NOT_IN_WINDOWS)
     return StageRecord(arrays, summary)
+
+
+def _keys(key: str, windows: list[Window]) -> list[str]:
+    """Return the key of every window's record: a window builds on the plan up to it."""
+    keys = []
+    for window in windows:
+        key = stage_key(key, [window.start, window.stop])
+        keys.append(key)
+    return keys
+
+
+def _in_order(found: Iterable[tuple[int, ResultT]]) -> list[ResultT]:
+    return [result for _, result in sorted(found, key=lambda pair: pair[0])]
 
 
 def _calibration(
@@ -159,33 +185,32 @@ def _calibration(
     config, given = windowed.config, windowed.sequence.intrinsics
     if config.input.intrinsics != "free":
         return key, given, np.zeros((4, 4)), []
-    frames = len(windowed.windows[0])
-
-    def compute() -> StageRecord:
-        found, covariance, solves = calibrate(windowed.labelled, given, frames, config, hooks, windowed.run)
-        stop_if_cancelled(solves, _STOPPED)
-        return StageRecord({"intrinsics": found, "covariance": covariance}, {"solves": [solve_dict(s) for s in solves]})
-
     key = stage_key(key, "calibration")
-    found = windowed.record("calibration", windowed.windows[0], key, compute)
+    found = windowed.store.load("calibration_000000", key) if windowed.resume else None
+    if found is None:
+        windowed.check_cancelled()
+        intrinsics, covariance, solves = calibrate(
+            windowed.labelled, given, len(windowed.windows[0]), config, hooks, windowed.run
+        )
+        stop_if_cancelled(solves, STOPPED)
+        arrays = {"intrinsics": intrinsics, "covariance": covariance}
+        found = StageRecord(arrays, {"solves": [solve_dict(s) for s in solves]})
+        windowed.store.save("calibration_000000", key, found)
     return key, found.arrays["intrinsics"], found.arrays["covariance"], found.summary["solves"]
 
 
-def _join(windowed: WindowedRun, scene_of: Callable[[int], WindowScene], intrinsics_covariance: FloatArray) -> Joined:
+def _join(windowed: WindowedRun, places: list[Place], intrinsics_covariance: FloatArray, hooks: Hooks) -> Joined:
     """Join the windows' cameras in rounds; landmarks follow before each linearization but the first."""
     config, windows = windowed.config, windowed.windows
     spans = TrackSpans.of(windowed.labelled)
-    cameras = chain(windows, [scene_of(i).cameras for i in range(len(windows))])
+    cameras = chain(windows, [place.scene().cameras for place in places])
     rounds, adding = config.windows.rounds, isinstance(windowed.run, AddingRunner)
     for number in range(rounds):
-        parts = []
-        for index in range(len(windows)):
-            windowed.check_cancelled()
-            scene = scene_of(index)
-            if number:
-                scene = place(scene, cameras, config.bundle_adjustment, windowed.run)
-            mine = owned(scene, spans, windows, index)
-            parts.append(information(mine, windows, index, config, log_scale_priors=not adding))
+        items = [
+            InformationItem(place, windows, index, spans, cameras, number == 0, not adding, config)
+            for index, place in enumerate(places)
+        ]
+        parts = _in_order(windowed.solve_each(hooks)(window_information, items))
         added = added_terms(windowed.run, cameras, config) if isinstance(windowed.run, AddingRunner) else None
         joined = join(parts, cameras, intrinsics_covariance, covariance=number == rounds - 1, added=added)
         cameras = joined.cameras
@@ -221,20 +246,6 @@ def _joined_arrays(windows: list[Window], joined: Joined, parts: list[WindowLand
         "landmarks": point, "landmark_track": track, "landmark_error": error.astype(np.float32),
         "pose_covariance": pose_covariance, "intrinsics_covariance": intrinsics_covariance, "noise": noise,
     }  # fmt: skip
-
-
-def _scene_part(scene: Arrays, window: Window, track: IntArray) -> Arrays:
-    """Return the part of a stage 2 record that stage 3 reads, for a window with these tracks."""
-    frames = slice(window.start, window.stop)
-    at = np.minimum(np.searchsorted(track, scene["landmark_track"]), max(len(track) - 1, 0))
-    here = track[at] == scene["landmark_track"] if len(track) else np.zeros(len(at), dtype=bool)
-    return {
-        **scene,
-        "world_T_cam": scene["world_T_cam"][frames],
-        "log_scale": scene["log_scale"][frames],
-        "landmarks": scene["landmarks"][here],
-        "landmark_track": at[here],
-    }
 
 
 def _joined_summary(arrays: Arrays, summaries: list[dict[str, Any]]) -> dict[str, Any]:

@@ -7,6 +7,16 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
+
+from uni4d_fg.errors import InputError
+from uni4d_fg.factors.priors import log_scale_prior
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import LOG_SCALE
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import StageRunner
+from uni4d_fg.optim.stage_graph import RecordingRunner, StageGraph
 from uni4d_fg.optim.threads import thread_count
 
 
@@ -26,3 +36,19 @@ def square_or_die(item: tuple[int, str, Path]) -> tuple[int, int, int]:
         if fate.endswith("raised"):
             raise RuntimeError(f"number {number} is broken")
     return number * number, os.getpid(), thread_count()
+
+
+def describe_window(item: tuple[int, str, Path], run: StageRunner, hooks: Hooks) -> int:
+    """Return the number of a window squared, and leave graphs of as many points as its number tells."""
+    number, fate, folder = item
+    if fate == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if fate == "gone":
+        raise InputError(f"{folder}: window {number} is gone")
+    assert isinstance(run, RecordingRunner)
+    for kind in ("structure", "nonrigid") if number < 2 else ("nonrigid",):
+        scales = np.zeros((number + 1, 1))
+        state = State({LOG_SCALE: scales})
+        problem = Problem.over(state).add(log_scale_prior(np.arange(number + 1), measured=scales, sigma=0.1))
+        run.solved[kind] = StageGraph(kind, problem, state, state)
+    return number * number

@@ -1,0 +1,192 @@
+"""Where the windows of a video are solved: one after the other here, or at once on worker processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, TypeVar
+
+from uni4d_fg.config.models import Config
+from uni4d_fg.errors import Cancelled, SolverError, Uni4dFgError
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.runners import stage_runner
+from uni4d_fg.optim.stage import StageRunner
+from uni4d_fg.optim.stage_graph import RecordingRunner, StageGraph
+from uni4d_fg.optim.threads import thread_count, thread_limit
+from uni4d_fg.pipeline.window_tasks import STOPPED
+from uni4d_fg.pipeline.workers.cluster import open_workers
+from uni4d_fg.pipeline.workers.memory import free_bytes, reconstruction_bytes, worker_count
+from uni4d_fg.pipeline.workers.options import WorkerOptions
+from uni4d_fg.pipeline.workers.spread import Lost, spread
+from uni4d_fg.slam.windows.plan import Window
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
+
+
+class SolveEach(Protocol):
+    """Does the same for every item, each on its own."""
+
+    def __call__(
+        self, function: Callable[[ItemT, StageRunner, Hooks], ResultT], items: Sequence[ItemT]
+    ) -> Iterator[tuple[int, ResultT]]:
+        """Yield index and result of each item, in any order.
+
+        Raises:
+            Uni4dFgError: What the function raises.
+            Cancelled: If the user interrupts.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class InOrder:
+    """One after the other, in this process."""
+
+    run: StageRunner
+    hooks: Hooks
+
+    def __call__(
+        self, function: Callable[[ItemT, StageRunner, Hooks], ResultT], items: Sequence[ItemT]
+    ) -> Iterator[tuple[int, ResultT]]:
+        """As :class:`SolveEach`."""
+        for index in range(len(items)):
+            if self.hooks.should_stop is not None and self.hooks.should_stop():
+                raise Cancelled(STOPPED)
+            yield index, function(items[index], self.run, self.hooks)
+
+
+NOT_ON_WORKERS = "windows were solved one after the other: added factors are functions of this process"
+
+
+@contextmanager
+def window_workers(
+    asked: WorkerOptions | None, windows: list[Window], image_size: tuple[int, int], folder: Path, config: Config,
+    recorder: RecordingRunner, should_stop: Callable[[], bool], *, alone: bool,
+) -> Iterator[WindowWorkers | None]:  # fmt: skip
+    """Give the worker processes that windows are solved on, if any, and inside the threads of one task.
+
+    What is solved in this process has that number of threads too, so that it does not matter where windows are solved.
+
+    Args:
+        asked: What the user asked for; None: nothing, and all threads.
+        windows: All windows.
+        image_size: (height, width), px.
+        folder: Of the windows' records.
+        config: The whole configuration.
+        recorder: Takes the graphs.
+        should_stop: Polled often.
+        alone: Whether windows must be solved in this process, whatever is asked for.
+    """
+    if asked is None:
+        yield None
+        return
+    cores = max(thread_count() // asked.threads, 1)
+    with thread_limit(asked.threads):
+        if alone or (asked.workers == 1 and asked.scheduler is None):
+            yield None
+            return
+        need = reconstruction_bytes(max(map(len, windows)), image_size)
+        count = min(asked.workers or worker_count(len(windows), need, cores, free_bytes()), len(windows))
+        with WindowWorkers(asked, count, folder.resolve(), config, recorder, should_stop) as workers:
+            yield workers
+
+
+@dataclass
+class WindowWorkers:
+    """On worker processes, which are started when they are first needed and end with the context.
+
+    A window whose process dies or hangs is tried again. The graphs that the windows' solves leave are put together as
+    if they had been solved in their order.
+    """
+
+    options: WorkerOptions
+    count: int
+    """Processes, if they are of this machine."""
+    folder: Path
+    """Of the windows' records; workers of a cluster must see it under the same path."""
+    config: Config
+    recorder: RecordingRunner
+    should_stop: Callable[[], bool]
+    _stack: ExitStack = field(default_factory=ExitStack)
+    _client: Any = None
+
+    def __enter__(self) -> WindowWorkers:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def __call__(
+        self, function: Callable[[ItemT, StageRunner, Hooks], ResultT], items: Sequence[ItemT]
+    ) -> Iterator[tuple[int, ResultT]]:
+        """As :class:`SolveEach`.
+
+        Raises:
+            SolverError: If a window was tried as often as allowed and its process died or was ended each time.
+        """
+        if not items:
+            return
+        if self._client is None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._client = self._stack.enter_context(open_workers(self.options, self.count, self.folder))
+        calls = _Calls(function, items, self.config)
+        traces = [self.folder / f"window_{index}.hang.txt" for index in range(len(items))]
+        came_from: dict[str, int] = {}
+        try:
+            for index, outcome in spread(self._client, _call, calls, self.options, traces, self.should_stop):
+                if isinstance(outcome, Lost):
+                    raise SolverError(f"a window cannot be solved on the workers: {outcome.why}")
+                if outcome.error is not None:
+                    raise outcome.error
+                for kind, graph in outcome.graphs.items():
+                    if index >= came_from.get(kind, -1):
+                        came_from[kind], self.recorder.solved[kind] = index, graph
+                yield index, outcome.result
+        except Cancelled as error:
+            raise Cancelled(STOPPED) from error
+
+
+@dataclass(frozen=True)
+class _Call:
+    """One item on its way to a worker."""
+
+    function: Callable[..., Any]
+    item: Any
+    config: Config
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What came of it."""
+
+    result: Any = None
+    error: Uni4dFgError | None = None
+    graphs: dict[str, StageGraph] = field(default_factory=dict)
+
+
+class _Calls(Sequence[_Call]):
+    """The calls of some items, each made when it is given out."""
+
+    def __init__(self, function: Callable[..., Any], items: Sequence[Any], config: Config) -> None:
+        self.function, self.items, self.config = function, items, config
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, index: Any) -> Any:
+        return _Call(self.function, self.items[index], self.config)
+
+
+def _call(call: _Call) -> _Outcome:
+    """Solve one window, in a worker; what goes wrong with it is an answer, for the process is sound."""
+    recorder = RecordingRunner(stage_runner(call.config))
+    try:
+        return _Outcome(call.function(call.item, recorder, Hooks()), graphs=recorder.solved)
+    except Uni4dFgError as error:
+        return _Outcome(error=error)
