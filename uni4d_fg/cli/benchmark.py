@@ -29,7 +29,13 @@ DatasetName = Annotated[
     str,
     typer.Argument(metavar="DATASET", help="sintel, tum-dynamics, bonn, kitti, davis, native, ...", show_default=False),
 ]
-Root = Annotated[Path, typer.Option(help="Folder of the dataset, as its archives unpack.", show_default=False)]
+Root = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder of the dataset, as its archives unpack. Not needed for 'synthetic': OUT/scenes.",
+        show_default=False,
+    ),
+]
 Out = Annotated[Path, typer.Option(help="Folder of runs, results and tables.")]
 Split = Annotated[
     str | None, typer.Option(help="Split of the dataset; its usual one if not given.", show_default=False)
@@ -87,7 +93,7 @@ Retries = Annotated[int, typer.Option(help="How often a run is tried again whose
 
 def benchmark(
     dataset: DatasetName,
-    root: Root,
+    root: Root = None,
     out: Out = Path("runs/benchmark"),
     split: Split = None,
     videos: Videos = None,
@@ -122,7 +128,7 @@ def benchmark(
     from uni4d_fg.pipeline.workers.options import WorkerOptions
 
     if check:
-        _check(dataset, root, split, videos, cues)
+        _check(dataset, _root(dataset, root, out), split, videos, cues)
         return
     if grid is not None:
         if presets or changes or intrinsics != "unknown":
@@ -146,7 +152,7 @@ def benchmark(
 
 def ablate(
     dataset: DatasetName,
-    root: Root,
+    root: Root = None,
     grid: Annotated[
         Path | None, typer.Argument(metavar="[GRID.yaml]", help="Rows; the paper's ablations if not given.")
     ] = None,
@@ -181,7 +187,7 @@ def ablate(
 
 def _experiment(
     name: str,
-    root: Path,
+    given_root: Path | None,
     out: Path,
     split: str | None,
     videos: list[str] | None,
@@ -204,7 +210,7 @@ def _experiment(
     from uni4d_fg.pipeline.benchmark.task import Task, TaskResult
     from uni4d_fg.pipeline.compare.machine import machine
 
-    root = resolved(root)
+    root = _root(name, given_root, out)
     dataset, wanted, cue_folder = _wanted(name, root, split, videos, cues)
     poses, depths = _chosen(protocols)
     tasks = [
@@ -281,7 +287,6 @@ def _check(name: str, root: Path, split: str | None, videos: list[str] | None, c
     from uni4d_fg.pipeline.benchmark.prepare import open_task
     from uni4d_fg.pipeline.benchmark.task import Configuration, Task
 
-    root = resolved(root)
     _, wanted, folder = _wanted(name, root, split, videos, cues)
     missing = 0
     for video in wanted:
@@ -300,6 +305,15 @@ def _check(name: str, root: Path, split: str | None, videos: list[str] | None, c
         typer.echo(f"{video}: {found.num_frames} frames of {width} x {height} px; truth: {texts[0]}; cues: {texts[1]}")
     if missing:
         raise InputError(f"{root}: {missing} of {len(wanted)} videos cannot be used")
+
+
+def _root(name: str, given: Path | None, out: Path) -> Path:
+    """Return the folder of a dataset. Raises ConfigError if it must be given and is not."""
+    from uni4d_fg.frontend.datasets.registry import find_dataset
+
+    if given is None and not find_dataset(name).card.is_made:
+        raise ConfigError(f"--root is missing: give the folder of {find_dataset(name).card.title}")
+    return resolved(given or out / "scenes")
 
 
 def _chosen(protocols: list[str] | None) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -35,6 +35,9 @@ class SyntheticSceneConfig(Section):
         "What moves: 'none', 'rigid', 'deforming', 'both', or 'all_dynamic' (both, and the room itself).",
     )
     objects_per_kind: int = setting(1, "Number of rigid and of deforming objects.", ge=1, le=MAX_OBJECTS_PER_KIND)
+    object_scale: float = setting(
+        1.0, "Size of the objects, of the usual one: the share of the image that moves.", ge=0.2, le=4
+    )
     grid_columns: int = setting(32, "Query points per row of the grid.", ge=2)
     grid_rows: int = setting(24, "Query points per column of the grid.", ge=2)
     query_interval: int = setting(10, "A new grid of tracks is started every this many frames.", ge=1)

@@ -42,6 +42,8 @@ class DatasetCard:
     """Cap of true depth in the field's tables, m."""
     selection: FrameSelection = field(default_factory=FrameSelection)
     """Which of the frames in the dataset's folders are used."""
+    is_made: bool = False
+    """Whether its videos are made when they are first opened, so that any folder will do."""
 
 
 class Dataset(ABC):
@@ -66,6 +68,11 @@ class Dataset(ABC):
         Raises:
             InputError: If something is missing or damaged; the message says what, and where to get it.
         """
+
+    def size(self, root: Path, video: str) -> tuple[int, tuple[int, int]]:
+        """Return the number of frames of a video and its (height, width), px. Raises as :meth:`open`."""
+        found = self.open(root, video)
+        return found.num_frames, found.image_size
 
     def notes(self, root: Path, video: str) -> tuple[str, ...]:
         """Return what a reader of the video's scores should know."""

@@ -51,11 +51,19 @@ class SyntheticSeries(Dataset):
         splits={"all": None},
         default_split="all",
         max_depth_m=None,
+        is_made=True,
     )
 
     def found(self, root: Path) -> tuple[str, ...]:
         """Return the names of all scenes, made or not."""
         return tuple(f"scene_{step}" for step in range(COUNT))
+
+    def size(self, root: Path, video: str) -> tuple[int, tuple[int, int]]:
+        """Return the number of frames of a scene and its (height, width), px, whether it is made yet or not."""
+        if video not in self.found(root) or is_present(root / video):
+            return super().size(root, video)
+        scene = scene_of(_step(video))
+        return scene.num_frames, (scene.height, scene.width)
 
     def open(self, root: Path, video: str) -> Video:
         """Open a scene; it is made and written if it is not there.
@@ -69,7 +77,7 @@ class SyntheticSeries(Dataset):
         if video in self.found(root) and not is_present(folder):
             from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
 
-            sequence = make_synthetic_sequence(scene_of(int(video.rpartition("_")[2])))
+            sequence = make_synthetic_sequence(scene_of(_step(video)))
             try:
                 write_native(sequence, folder)
             except OutputError:
@@ -80,3 +88,7 @@ class SyntheticSeries(Dataset):
     def remedy(self, root: Path) -> str:
         """Return the names there are."""
         return f"the scenes are scene_0 to scene_{COUNT - 1}"
+
+
+def _step(video: str) -> int:
+    return int(video.rpartition("_")[2])

@@ -82,7 +82,7 @@ _RIGID_CENTERS = ((-0.35, 0.2, 0.15), (-0.9, -0.3, 1.05), (0.25, -0.6, 1.1))
 _DEFORMING_CENTERS = ((0.55, 0.33, 0.45), (1.0, -0.3, 1.2), (-0.3, -0.05, 1.75))
 
 
-def _rigid_object(index: int) -> SceneObject:
+def _rigid_object(index: int, size: float) -> SceneObject:
     motion = RigidMotion(
         center=_RIGID_CENTERS[index],
         swing=(0.3, 0.12, 0.2),
@@ -91,12 +91,12 @@ def _rigid_object(index: int) -> SceneObject:
         tilt=(0.35, 0.5, 0.1 + index),
         rotation_rate=(0.2, 0.45, 0.15) if index % 2 == 0 else (0.1, -0.4, 0.2),
     )
-    scale = 1.0 if index == 0 else 0.7
+    scale = size * (1.0 if index == 0 else 0.7)
     mesh = box((0.55 * scale, 0.42 * scale, 0.38 * scale))
     return SceneObject(mesh, _RIGID_STYLE, 2 * index + 1, motion)
 
 
-def _deforming_object(index: int) -> SceneObject:
+def _deforming_object(index: int, size: float) -> SceneObject:
     carrier = RigidMotion(
         center=_DEFORMING_CENTERS[index],
         swing=(0.18, 0.05, 0.2),
@@ -105,19 +105,20 @@ def _deforming_object(index: int) -> SceneObject:
         tilt=(0.0, 0.3, 0.08),
         rotation_rate=(0.0, -0.3, 0.0),
     )
-    scale = 1.0 if index == 0 else 0.7
+    scale = size * (1.0 if index == 0 else 0.7)
     height = scale * _DEFORMING_HEIGHT_M
     motion = WobblyMotion(carrier, height, bend_m=0.14 * scale, wave_m=0.04 * scale, phase=0.5 + index)
     return SceneObject(capsule(0.18 * scale, height), _DEFORMING_STYLE, 2 * index + 2, motion)
 
 
-def make_scene(objects: ObjectChoice = "both", objects_per_kind: int = 1) -> Scene:
+def make_scene(objects: ObjectChoice = "both", objects_per_kind: int = 1, object_scale: float = 1.0) -> Scene:
     """Build the room and what moves in it.
 
     Args:
         objects: Which movers there are. ``"all_dynamic"`` has both kinds and moves the room itself, as a
             rigid instance of its own, so that nothing in sight is static.
         objects_per_kind: Number of rigid and of deforming movers, at most ``MAX_OBJECTS_PER_KIND``.
+        object_scale: Size of the movers, of the usual one.
 
     Raises:
         ValueError: If ``objects_per_kind`` is out of range.
@@ -136,7 +137,7 @@ def make_scene(objects: ObjectChoice = "both", objects_per_kind: int = 1) -> Sce
         )
     parts = [SceneObject(mesh, style, room_instance, room_motion) for mesh, style in furnished_room()]
     if objects in ("rigid", "both", "all_dynamic"):
-        parts += [_rigid_object(i) for i in range(objects_per_kind)]
+        parts += [_rigid_object(i, object_scale) for i in range(objects_per_kind)]
     if objects in ("deforming", "both", "all_dynamic"):
-        parts += [_deforming_object(i) for i in range(objects_per_kind)]
+        parts += [_deforming_object(i, object_scale) for i in range(objects_per_kind)]
     return Scene(tuple(parts))

@@ -47,7 +47,7 @@ def simulate(config: SyntheticSceneConfig) -> Simulation:
     lens = Lens(config.camera_model, config.distortion)
     timestamps = np.arange(config.num_frames) / config.frame_rate
     world_T_cam = camera_path(config.path, timestamps, config.camera_speed)
-    scene = make_scene(config.objects, config.objects_per_kind)
+    scene = make_scene(config.objects, config.objects_per_kind, config.object_scale)
 
     depths = np.empty((config.num_frames, *image_size), dtype=np.float32)
     masks = np.empty((config.num_frames, *image_size), dtype=np.int32)

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from uni4d_fg.errors import Uni4dFgError
+from uni4d_fg.frontend.datasets.registry import find_dataset
 from uni4d_fg.optim.threads import thread_count
-from uni4d_fg.pipeline.benchmark.prepare import open_task
 from uni4d_fg.pipeline.benchmark.runner import Execute, run_task
 from uni4d_fg.pipeline.benchmark.task import Task, TaskResult
 from uni4d_fg.pipeline.workers.cluster import open_workers
@@ -64,8 +64,8 @@ def fitting_workers(tasks: list[Task], threads: int) -> int:
     need = 0
     for task in {(task.dataset, task.video, task.max_size): task for task in tasks}.values():
         try:
-            video = open_task(task)
+            frames, image_size = find_dataset(task.dataset).size(Path(task.root), task.video)
         except Uni4dFgError:  # its run will say so
             continue
-        need = max(need, reconstruction_bytes(video.num_frames, video.image_size))
+        need = max(need, reconstruction_bytes(frames, image_size))
     return worker_count(len(tasks), need, max(thread_count() // threads, 1), free_bytes())

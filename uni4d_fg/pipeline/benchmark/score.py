@@ -11,10 +11,12 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.frontend.sequence.frames import no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
-from uni4d_fg.geometry.camera import world_to_camera
+from uni4d_fg.geometry.alignment import align_trajectories
+from uni4d_fg.geometry.camera import camera_to_world, world_to_camera
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.pipeline.store import StageStore
 from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.evaluate.points import evaluate_points
 from uni4d_fg.results.evaluate.protocols.consistency import score_consistency
 from uni4d_fg.results.evaluate.protocols.depth import DEPTH_PROTOCOLS, score_depth
 from uni4d_fg.results.evaluate.protocols.pose import POSE_PROTOCOLS, score_poses
@@ -22,6 +24,10 @@ from uni4d_fg.results.evaluate.protocols.tracks3d import score_tracks
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import Reconstruction
+
+_STILL_M = 0.002
+"""A point that moves by less in the whole video is static."""
+POINT_PROTOCOL = "observed, aligned by Sim(3) Umeyama of the cameras"
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,8 @@ def score_estimate(
         masks: T label maps of the size of the estimate's depth, for self-consistency.
 
     Returns:
-        By kind: 'poses' and 'depth' by protocol, 'consistency', 'tracks'; a kind that cannot be scored is not there.
+        By kind: 'poses' and 'depth' by protocol, 'consistency', 'tracks', 'points'; a kind that cannot be scored is not
+        there.
         'regions' says whose masks parted the depth.
     """
     truth = video.ground_truth
@@ -88,6 +95,9 @@ def score_estimate(
         tracked = _score_tracks(video, *estimate.tracks)
         if tracked is not None:
             found["tracks"] = tracked
+        points = _score_points(video, estimate.world_T_cam, *estimate.tracks)
+        if points is not None:
+            found["points"] = points
     return found
 
 
@@ -124,6 +134,26 @@ def _tracks_of(found: Reconstruction, sequence: Sequence) -> tuple[FloatArray, B
     seen[found.dynamic_track] = found.dynamic_observed
     points = np.stack([world_to_camera(pose, world[:, t]) for t, pose in enumerate(found.world_T_cam)], axis=1)
     return points, seen & np.isfinite(points).all(axis=2)
+
+
+def _score_points(
+    video: Video, world_T_cam: FloatArray | None, points: FloatArray, seen: BoolArray
+) -> dict[str, Any] | None:
+    """Return the errors of static and of moving points where they are seen, in the true world, by Sim(3) of cameras."""
+    truth, true_poses = video.ground_truth.track_points, video.ground_truth.world_T_cam
+    if truth is None or true_poses is None or world_T_cam is None or truth.shape != points.shape:
+        return None
+    if not (np.isfinite(true_poses).all() and np.isfinite(world_T_cam).all()):
+        return None
+    world = np.stack([camera_to_world(pose, points[:, t]) for t, pose in enumerate(world_T_cam)], axis=1)
+    similarity = align_trajectories(world_T_cam, true_poses)
+    known = np.isfinite(truth)
+    span = np.where(known, truth, -np.inf).max(axis=1) - np.where(known, truth, np.inf).min(axis=1)
+    moving: BoolArray = np.asarray((span > _STILL_M).any(axis=1))
+    return {
+        name: evaluate_points(world, truth, seen & rows[:, None], similarity, protocol=POINT_PROTOCOL).to_dict()
+        for name, rows in (("static", ~moving), ("moving", moving))
+    }
 
 
 def _score_tracks(video: Video, points: FloatArray, seen: BoolArray) -> dict[str, Any] | None:

@@ -60,7 +60,8 @@ def all_tables(
         with_cue = [*methods, *_cues(methods)]
         tables += [depth_table(title, name, with_cue, told), depth_videos(title, name, with_cue)]
     told = [p.row() for p in published if p.fits(dataset, "consistency")]
-    tables += [consistency_table(title, [*methods, *_cues(methods)], told), tracks_table(title, methods)]
+    tables += [consistency_table(title, [*methods, *_cues(methods)], told), points_table(title, methods)]
+    tables += [tracks_table(title, methods)]
     tables += [runtime_table(title, methods)]
     return [table for table in tables if _says_something(table)]
 
@@ -167,6 +168,27 @@ def tracks_table(title: str, methods: list[Method]) -> Table:
     columns = [*(Column(name, better="high") for name in keys), *_COUNTS]
     note = "TAPVid-3D, scaled by the median distance; visibility of the truth is that of the given tracks"
     return Table("tracks", f"{title}: tracking in 3D", "method", columns, rows, [note, _FAILED])
+
+
+def points_table(title: str, methods: list[Method]) -> Table:
+    """Return the errors of points that are static and that move, in mm: medians and RMSE, averaged over videos."""
+
+    def value(result: TaskResult, key: str) -> float | None:
+        region, measure = key.split(".")
+        found = _of(result.scores.get("points", {}).get(region), measure)
+        return None if found is None else 1000.0 * float(found)
+
+    keys = {
+        f"{region} {name}": f"{region}.{measure}"
+        for region in ("static", "moving")
+        for name, measure in (("median", "median_m"), ("RMSE", "rmse_m"))
+    }
+    rows = [_averaged(m, value, keys) for m in methods]
+    note = "mm, where a point is seen, in the true world: aligned by Sim(3) Umeyama of the cameras; mean over videos"
+    return Table(
+        "points", f"{title}: errors of points", "method", [*(Column(name, 1) for name in keys), *_COUNTS], rows,
+        [note, _FAILED],
+    )  # fmt: skip
 
 
 def runtime_table(title: str, methods: list[Method]) -> Table:

@@ -17,7 +17,7 @@ from uni4d_fg.reading import read_json
 Masks: TypeAlias = Literal["cue", "true", "motion", "none"]
 """Of the cues, of the truth, from motion, or none at all: everything is static."""
 
-RESULT_VERSION = 1
+RESULT_VERSION = 2
 """Part of every key; raised whenever scores come out otherwise."""
 
 

@@ -1,0 +1,133 @@
+"""How much faster worker processes are than one after the other: windows of one long video, and many videos.
+
+    python benchmarks/workers.py windows --frames 1000 --workers 2
+    python benchmarks/workers.py videos --count 10 --workers 4
+
+Both ways have one thread per task and end in the same bytes, which is checked. Wall time says something only on a
+machine that does nothing else. The CPU time of this process and of its busiest worker together is about what the wall
+time would be there, as this process mostly waits for the workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.open_video import open_video
+from uni4d_fg.frontend.sequence.write import write_native
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.pipeline.benchmark.on_workers import on_workers
+from uni4d_fg.pipeline.benchmark.runner import one_after_the_other
+from uni4d_fg.pipeline.benchmark.task import Configuration, Task
+from uni4d_fg.pipeline.workers.options import WorkerOptions
+
+_BARE = ("output.clouds=false", "output.pictures=false")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("what", choices=("windows", "videos"))
+    parser.add_argument("--frames", type=int, help="of a video; 1000 for windows, 24 for videos")
+    parser.add_argument("--count", type=int, default=10, help="videos")
+    parser.add_argument("--window", type=int, default=100, help="frames of a window")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--root", type=Path, help="folder of the scenes, kept; else a temporary one")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        frames = asked.frames or (1000 if asked.what == "windows" else 24)
+        count = 1 if asked.what == "windows" else asked.count
+        root = make_scenes(asked.root or folder / "scenes", count, frames)
+        run = windows if asked.what == "windows" else videos
+        both = {}
+        for workers in (1, asked.workers):
+            out = folder / f"{workers}"
+            out.mkdir()
+            both[workers] = measure(lambda: run(root, out, workers, asked.window))  # noqa: B023 - called at once
+            wall, own, busiest = both[workers]
+            print(f"{workers} at once: {wall:.1f} s wall, CPU {own:.1f} s here, {busiest:.1f} s of the busiest worker")
+        serial, spread = both[1], both[asked.workers]
+        print(f"wall {serial[0] / spread[0]:.2f} times faster, CPU {sum(serial[1:]) / sum(spread[1:]):.2f} times")
+        compare(folder / "1", folder / f"{asked.workers}")
+
+
+def make_scenes(root: Path, count: int, frames: int) -> Path:
+    """Make small scenes with given tracks where they are not there yet."""
+    for number in range(count):
+        if not (root / f"scene_{number}").exists():
+            scene = SyntheticSceneConfig(
+                num_frames=frames, height=120, width=160, focal=150.0, margin_px=3.0, grid_columns=16, grid_rows=12,
+                query_interval=10, frame_rate=30.0, seed=number,
+            )  # fmt: skip
+            write_native(make_synthetic_sequence(scene), root / f"scene_{number}")
+    return root
+
+
+def windows(root: Path, out: Path, workers: int, frames: int) -> None:
+    """Reconstruct one video in windows."""
+    config = load_config("default", [f"windows.frames={frames}", "windows.overlap=20", *_BARE])
+    sequence = as_sequence(open_video(root / "scene_0"))
+    reconstruct(sequence, out / "run", config, workers=WorkerOptions(workers=workers))
+
+
+def videos(root: Path, out: Path, workers: int, _: int) -> None:
+    """Reconstruct and score every video."""
+    row = Configuration("default", "default", _BARE)
+    names = sorted(path.name for path in root.iterdir())
+    tasks = [Task("native", str(root), name, row, str(out), depth_protocols=("uni4d-scale",)) for name in names]
+    execute = one_after_the_other() if workers == 1 else on_workers(WorkerOptions(workers=workers))
+    failed = [result.failed for result in execute(tasks) if result.failed is not None]
+    if failed:
+        raise SystemExit(f"{len(failed)} runs failed: {failed[0]}")
+
+
+def measure(work: Callable[[], None]) -> tuple[float, float, float]:
+    """Return wall time, and the CPU time of this process and of its busiest child, s."""
+    me, children, end = psutil.Process(), dict[int, float](), threading.Event()
+
+    def watch() -> None:
+        while not end.wait(0.3):
+            for child in me.children(recursive=True):
+                try:
+                    spent = child.cpu_times()
+                except psutil.Error:  # it has ended
+                    continue
+                children[child.pid] = spent.user + spent.system
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    began, own = time.perf_counter(), time.process_time()
+    watcher.start()
+    work()
+    wall, own = time.perf_counter() - began, time.process_time() - own
+    end.set()
+    watcher.join()
+    return wall, own, max(children.values(), default=0.0)
+
+
+def compare(one: Path, other: Path) -> None:
+    """Stop unless all reconstructions and depths are equal to the last bit."""
+    files = sorted(p.relative_to(one) for p in one.rglob("*") if p.name in ("reconstruction.npz", "depth.npy"))
+    for file in files:
+        if file.suffix == ".npy":
+            if (one / file).read_bytes() != (other / file).read_bytes():
+                raise SystemExit(f"{file}: differs")
+            continue
+        with np.load(one / file) as a, np.load(other / file) as b:
+            if any(a[name].tobytes() != b[name].tobytes() for name in a.files):
+                raise SystemExit(f"{file}: differs")
+    print(f"{len(files)} files with the same bytes: {', '.join(sorted({file.name for file in files}))}")
+
+
+if __name__ == "__main__":
+    main()
