@@ -13,12 +13,16 @@ import numpy as np
 import pytest
 
 from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.datasets import synthetic
 from uni4d_fg.frontend.datasets.registry import find_dataset
+from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.pipeline.benchmark import runner
 from uni4d_fg.pipeline.benchmark.prepare import open_task, prepare, with_cues
 from uni4d_fg.pipeline.benchmark.runner import one_after_the_other, run_task, run_tasks
 from uni4d_fg.pipeline.benchmark.score import Estimate, score_estimate
 from uni4d_fg.pipeline.benchmark.task import Configuration, Task, TaskResult
+from uni4d_fg.results.evaluate.run import evaluate_run
 
 pytest.importorskip("open3d")
 
@@ -213,3 +217,32 @@ def test_a_wrong_command_is_explained(
 ) -> None:
     found, _, err = cli("benchmark", *words, "--root", root, "--out", tmp_path)
     assert (found, message in err) == (code, True), err
+
+
+def test_synthetic_scenes_need_no_folder_and_other_datasets_say_that_they_do(
+    cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {
+        "num_frames": 7, "height": 60, "width": 80, "focal": 75.0, "grid_columns": 14, "grid_rows": 10,
+        "query_interval": 4, "margin_px": 3.0, "frame_rate": 4.0,
+    }  # fmt: skip
+    made = [synthetic.scene_of(step, **small) for step in range(synthetic.COUNT)]
+    monkeypatch.setattr(synthetic, "scene_of", lambda step: made[step])
+    folder = tmp_path / "scenes"
+    assert find_dataset("synthetic").size(folder, "scene_0") == (7, (60, 80))
+    assert not folder.exists()  # how large they are is known before they are made
+    words = ["--out", tmp_path, "--config", "fast", "--quiet", "--workers", 1, "--no-pictures", "--video", "scene_0"]
+    code, _, _ = cli("benchmark", "synthetic", *words, *(word for change in CONFIG for word in ("--set", change)))
+    assert code == 0
+    assert (folder / "scene_0").is_dir()
+    (row,) = csv.DictReader((tmp_path / "tables" / "points.csv").open())
+    score = json.loads((tmp_path / "results" / "fast" / "scene_0.json").read_text())["scores"]["points"]
+    assert float(row["moving median"]) == pytest.approx(1000.0 * score["moving"]["median_m"])
+    report = evaluate_run(tmp_path / "runs" / "fast" / "scene_0", as_sequence(open_video(folder / "scene_0")))
+    assert report.dynamic_points is not None
+    assert score["moving"]["points"] > 20
+    assert score["moving"]["median_m"] == pytest.approx(report.dynamic_points[0].median_m)
+    assert score["static"]["points"] > 200
+    code, _, err = cli("benchmark", "bonn", "--out", tmp_path)
+    assert code == 2
+    assert "--root is missing: give the folder of Bonn" in err
