@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -10,16 +11,17 @@ from stage_samples import K, camera_path, hide, observe, shift, static_observati
 
 from uni4d_fg.config.adam import AdamConfig, AdamScheduleConfig
 from uni4d_fg.config.solver import KernelConfig, SolverConfig
-from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig, NonRigidConfig
+from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraInitConfig, CameraMotionConfig, NonRigidConfig
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS
-from uni4d_fg.frontend.track_model import TrackLabel
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS, POSE
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import camera_to_world, project, world_to_camera
 from uni4d_fg.optim.adam.runner import AdamRunner
 from uni4d_fg.optim.stage import Stage
 from uni4d_fg.pipeline.steps import paper_energy
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
+from uni4d_fg.slam.stages.camera_init import PairSource, window_stage
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy
 from uni4d_fg.slam.stages.nonrigid import PointMesh, build_mesh, nonrigid_problem
 from uni4d_fg.slam.stages.observations import Observations, observations_of
@@ -79,7 +81,7 @@ def camera_motion(poses: np.ndarray, normalization: Normalization) -> tuple[floa
     """E_rot and E_trans."""
     floor = CameraMotionConfig()
     rotation, translation = [], []
-    for t in range(1, FRAMES - 1):
+    for t in range(1, len(poses) - 1):
         turns = [se3.so3_log(poses[t + i - 1, :3, :3].T @ poses[t + i, :3, :3]) for i in range(2)]
         steps = [poses[t + i, :3, 3] - poses[t + i - 1, :3, 3] for i in range(2)]
         rotation.append(relative_change(turns[0], turns[1], floor.rotation_floor_rad))
@@ -201,10 +203,56 @@ def test_the_dynamic_energy_does_not_see_a_rigid_motion(
     assert there == pytest.approx(here, rel=1e-9)
 
 
+def depth_reprojection_sum(
+    labelled: LabelledTracks, poses: np.ndarray, frames: list[int], normalization: Normalization
+) -> float:
+    """Stage 1: every ordered pair of frames, every track with depth in the first and seen in the second."""
+    camera = np.array([[K[0], 0.0, K[2]], [0.0, K[1], K[3]], [0.0, 0.0, 1.0]])
+    pairs = []
+    for i, j in itertools.permutations(frames, 2):
+        norms, weights = [], []
+        for k in range(labelled.tracks.num_tracks):
+            if labelled.weight[k, i] > 0 and labelled.weight[k, j] > 0 and np.isfinite(labelled.depth[k, i]):
+                pixel = np.append(labelled.tracks.uv[k, i].astype(np.float64), 1.0)
+                lifted = poses[i] @ np.append(np.linalg.solve(camera, pixel) * float(labelled.depth[k, i]), 1.0)
+                seen = camera @ (np.linalg.inv(poses[j]) @ lifted)[:3]
+                norms.append(np.linalg.norm(labelled.tracks.uv[k, j] - seen[:2] / seen[2]))
+                weights.append(np.sqrt(float(labelled.weight[k, i]) * float(labelled.weight[k, j])))
+        pairs.append(
+            np.sum(np.multiply(norms, weights)) if normalization == "sum" else np.average(norms, None, weights)
+        )
+    return float(np.sum(pairs) if normalization == "sum" else np.mean(pairs))
+
+
+@pytest.mark.parametrize("normalization", NORMALIZATIONS)
+def test_the_loss_of_adam_in_stage_1_is_the_formula_of_the_paper(
+    poses: np.ndarray, rng: np.random.Generator, normalization: Normalization
+) -> None:
+    labelled = shift(observe(static_points(rng, TRACKS), poses), rng.normal(size=(TRACKS, FRAMES, 2)))
+    labelled = hide(labelled, rng.random((TRACKS, FRAMES)) < 0.2)
+    unequal = rng.uniform(0.2, 1.0, labelled.weight.shape).astype(np.float32)
+    wrong = rng.uniform(0.9, 1.1, labelled.depth.shape).astype(np.float32)
+    labelled = replace(labelled, weight=labelled.weight * unequal, depth=labelled.depth * wrong)
+    config = CameraInitConfig(kernel=NORM, camera_motion=CameraMotionConfig(), max_tracks_per_pair=0)
+    frames = [1, 2, 3, 4, 5]
+    state = State({POSE: poses, INTRINSICS: K[None]})
+    stage = window_stage(
+        np.array(frames), state, PairSource(labelled, 0), config, free_intrinsics=False,
+        energy=PaperEnergy(normalization),
+    )  # fmt: skip
+    # As in the authors' program, the newest frame begins where the one before it is.
+    start = np.concatenate([poses[:-1], poses[-2:-1]])
+    expected = depth_reprojection_sum(labelled, start, frames, normalization) + sum(
+        camera_motion(start[frames], normalization)
+    )
+    assert first_loss(stage, state) == pytest.approx(expected, rel=1e-8)
+    assert expected > 1.0
+
+
 def first_loss(stage: Stage, state: State) -> float:
     """What Adam minimizes, before its first step."""
     once = AdamScheduleConfig(max_iterations=1)
-    config = AdamConfig(precision="float64", bundle_adjustment=once, nonrigid=once)
+    config = AdamConfig(precision="float64", camera_init=once, bundle_adjustment=once, nonrigid=once)
     _, summary = AdamRunner(config)(stage, state)
     return summary.iterations[0].energy
 
