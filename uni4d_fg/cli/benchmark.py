@@ -242,8 +242,9 @@ def _experiment(
         page = write_tables(out, facts, tables, methods)
         if pictures:
             reporter.begin("pictures", None)
-            draw_pictures(out, root, name, methods, tables)
+            drawn = draw_pictures(out, root, name, methods, tables)
             reporter.end()
+            page = write_tables(out, facts, tables, methods, drawn)
     typer.echo(page)
     if all(result.failed is not None for results in found.values() for result in results.values()):
         first = next(result.failed for results in found.values() for result in results.values())

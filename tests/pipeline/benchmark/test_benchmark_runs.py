@@ -79,6 +79,12 @@ def test_one_command_runs_and_scores_a_dataset(root: Path, cli: Run, tmp_path: P
     assert pictures == {
         "alley_2-path.png", "alley_2-depth.png", "ambush_4-path.png", "ambush_4-depth.png", "runtime.png"
     }  # fmt: skip
+    page = (tmp_path / "benchmark.md").read_text()
+    assert page.index("Sintel (final): in short") < page.index("camera poses, `sim3`")
+    assert {name.split(")")[0].removeprefix("pictures/") for name in page.split("](")[1:]} == pictures
+    assert "AbsRel of every video, `uni4d-scale`" in page
+    assert "AbsRel of every video, `uni4d-scale-shift`" not in page  # in its own file
+    assert "tables/depth-uni4d-scale-shift-videos.md" in page
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.json")}
     assert cli(*words, "--no-pictures")[0] == 0
     changed = {path.stem for path, time in before.items() if path.stat().st_mtime_ns != time}

@@ -11,6 +11,7 @@ import pytest
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.pipeline.benchmark.grid import PAPER, configurations, read_grid
 from uni4d_fg.pipeline.benchmark.published import read_published
+from uni4d_fg.pipeline.benchmark.short import short_table
 from uni4d_fg.pipeline.benchmark.table import Column, Row, Table, latex_text
 from uni4d_fg.pipeline.benchmark.tables import Method, all_tables
 from uni4d_fg.pipeline.benchmark.task import Configuration, Task, TaskResult, stored_result
@@ -149,3 +150,22 @@ def test_a_stored_result_counts_only_for_its_own_task(tmp_path: Path) -> None:
     assert stored_result(task) is None
     task.result_file.write_text("{")
     assert stored_result(task) is None
+
+
+def test_small_numbers_keep_two_digits_and_the_first_table_has_one_line_per_method() -> None:
+    rows = [Row("x", {"a": 0.00123, "b": 0.4}), Row("y", {"a": 0.5})]
+    shown = Table("t", "t", "row", [Column("a"), Column("b", 0)], rows)
+    assert shown.cells() == [["x", "0.0012", "0"], ["y", "0.500", "–"]]
+    assert Table("t", "t", "row", [Column("a")], [Row("x", {"a": 1e-9})]).cells() == [["x", "0.000"]]
+    poses = Table(
+        "poses-sim3", "", "method", [Column("ATE"), Column("RPE trans")],
+        [Row("printed", {"ATE": 1.0}, "published"), Row("mine", {"ATE": 0.25, "RPE trans": 3.0})],
+    )  # fmt: skip
+    rows = [Row("mine", {"SC": 0.5}), Row("depth cue", {"SC": 2.0})]
+    consistency = Table("consistency", "", "method", [Column("SC")], rows)
+    found = short_table("Scenes", [poses, consistency])
+    assert found is not None
+    assert found.names() == ["method", "ATE, m ↓", "SC ↓"]
+    assert found.cells() == [["mine", "0.250", "0.500"], ["depth cue", "–", "2.000"]]
+    assert found.notes == ["poses: `sim3`"]
+    assert short_table("Nothing", []) is None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.pipeline.benchmark.pictures import draw_runtime, draw_video
+from uni4d_fg.pipeline.benchmark.short import is_detail, short_table
 from uni4d_fg.pipeline.benchmark.table import Table
 from uni4d_fg.pipeline.benchmark.tables import Method
 
@@ -26,8 +28,17 @@ class Facts:
     machine: dict[str, str]
 
 
-def write_tables(folder: Path, facts: Facts, tables: list[Table], methods: list[Method]) -> str:
+def write_tables(
+    folder: Path, facts: Facts, tables: list[Table], methods: list[Method], pictures: Sequence[Path] = ()
+) -> str:
     """Write every table as ``.md``, ``.tex`` and ``.csv``, the page and ``benchmark.json``.
+
+    Args:
+        folder: Of the experiment.
+        facts: About it.
+        tables: All of them.
+        methods: All rows.
+        pictures: What the page shows, in the folder.
 
     Returns:
         The page.
@@ -38,7 +49,7 @@ def write_tables(folder: Path, facts: Facts, tables: list[Table], methods: list[
     for table in tables:
         for suffix, text in (("md", table.markdown()), ("tex", table.latex()), ("csv", table.comma_separated())):
             atomic_write_text(folder / "tables" / f"{table.name}.{suffix}", text)
-    page = _page(facts, tables, methods)
+    page = _page(facts, tables, methods, [path.relative_to(folder) for path in pictures])
     atomic_write_text(folder / REPORT, page)
     told = {
         "dataset": facts.dataset, "split": facts.split, "convention": facts.convention, "command": facts.command,
@@ -84,7 +95,7 @@ def draw_pictures(folder: Path, root: Path, dataset: str, methods: list[Method],
     return files
 
 
-def _page(facts: Facts, tables: list[Table], methods: list[Method]) -> str:
+def _page(facts: Facts, tables: list[Table], methods: list[Method], pictures: list[Path]) -> str:
     tried = max((len(m.results) for m in methods), default=0)
     lines = [f"# {facts.title}, split `{facts.split}`", "", f"    {facts.command}", ""]
     lines += [f"{tried} videos; {facts.convention}.", ""]
@@ -92,8 +103,16 @@ def _page(facts: Facts, tables: list[Table], methods: list[Method]) -> str:
     failures = [(m.name, v, r.failed) for m in methods for v, r in m.results.items() if r.failed is not None]
     if failures:
         lines += ["## What failed", "", *(f"- {name}, {video}: {why}" for name, video, why in failures), ""]
+    short = short_table(facts.title, tables)
+    lines += [] if short is None else [short.markdown()]
+    lines += [f"![runtime]({path.as_posix()})\n" for path in pictures if path.stem == "runtime"]
     notes = [(video, note) for m in methods for video, r in m.results.items() for note in r.notes]
-    lines += ["## Tables", "", *(table.markdown() for table in tables)]
+    lines += ["## Tables", "", *(table.markdown() for table in tables if not is_detail(table, tables))]
+    left_out = [f"`tables/{table.name}.md`" for table in tables if is_detail(table, tables)]
+    lines += [f"More: {', '.join(left_out)}", ""] if left_out else []
     if notes:
         lines += ["## Notes on videos", "", *dict.fromkeys(f"- {video}: {note}" for video, note in notes), ""]
+    shown = [path for path in pictures if path.stem != "runtime"]
+    if shown:
+        lines += ["## Pictures", "", *(f"![{path.stem}]({path.as_posix()})\n" for path in shown)]
     return "\n".join(lines)

@@ -7,6 +7,8 @@ import io
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
 Kind: TypeAlias = Literal["run", "read", "published"]
 """Of a row: run here, read from another program's files, or printed in a paper."""
 
@@ -129,4 +131,8 @@ def latex_text(text: str) -> str:
 def _text(value: float | int | None, digits: int) -> str:
     if value is None:
         return "–"
-    return str(value) if isinstance(value, int) else f"{value:.{digits}f}"
+    if isinstance(value, int):
+        return str(value)
+    # Of a number that begins in the last digits two are shown: millimeters in a column of meters.
+    small = digits > 0 and 10.0 ** (-2 - digits) < abs(value) < 10.0 ** (1 - digits)
+    return np.format_float_positional(float(f"{value:.1e}"), trim="k") if small else f"{value:.{digits}f}"
