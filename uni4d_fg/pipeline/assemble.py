@@ -88,7 +88,6 @@ def write_views(
     Raises:
         Cancelled: If ``should_stop`` said so.
         OutputError: If a file cannot be written.
-        MissingDependencyError: If clouds are asked for and Open3D cannot be loaded.
     """
     remove_views(folder)
     if not (config.output.clouds or config.output.pictures):

@@ -13,12 +13,14 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.frames import FramesInTurn
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
+from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.depth_store import write_depth
@@ -78,6 +80,12 @@ def fuse_depth(
         unmatched = "is not made of frames that zoom"
     elif config.multiview.enabled and core is None:
         unmatched = f"is left out, as {reason}: run `{INSTALL_COMMAND}`"
+    sequence = replace(
+        sequence,
+        images=FramesInTurn(sequence.images),
+        depths=FramesInTurn(sequence.depths),
+        masks=FramesInTurn(sequence.masks),
+    )
     control = [control_points(labelled, scene, motion, frame) for frame in range(sequence.num_frames)]
     broken = contradicting_frames(control, config)
     intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)
@@ -87,11 +95,15 @@ def fuse_depth(
     # Anew, as the frames that were tried are not in order.
     maps = replace(maps, unmatched=unmatched, matched=0, made={})
     with write_depth(path, sequence.num_frames, sequence.image_size) as writer:
-        for frame in range(sequence.num_frames):
+        threads = thread_count()
+        for first in range(0, sequence.num_frames, threads):
             if should_stop():
                 raise Cancelled("stopped during fusion; finished stages are kept, --resume continues from them")
-            writer.write(frame, maps.final(frame))
-            reporter.advance(frame + 1)
+            frames = list(range(first, min(first + threads, sequence.num_frames)))
+            maps.prepare(frames, threads)
+            for frame, depth in zip(frames, map_in_order(maps.final, frames, threads), strict=True):
+                writer.write(frame, depth)
+                reporter.advance(frame + 1)
     return maps.summary()
 
 
@@ -141,13 +153,32 @@ class DenseMaps:
         with np.errstate(invalid="ignore"):
             return np.where(np.isfinite(cue) & (cue > 0.0), cue, np.float32(np.nan))
 
+    def prepare(self, frames: list[int], threads: int) -> None:
+        """Make what :meth:`final` needs for frames that follow each other, and forget what only those before needed."""
+        if self.config.static == "nearest_points":
+            return
+        reach = max(self.config.averaged_offsets, default=0)
+        self.made = {number: made for number, made in self.made.items() if number >= frames[0] - reach}
+        near = {
+            frame + sign * offset
+            for frame in frames
+            for offset in (0, *self.config.averaged_offsets)
+            for sign in (-1, 1)
+        }
+        wanted = sorted(number for number in near if 0 <= number < self.sequence.num_frames and number not in self.made)
+        alone = [number for number in wanted if number not in self.broken]
+        # Frames that are matched share what they are matched with, and matching has threads of its own; a broken frame
+        # takes its cue from others.
+        map_in_order(self._static, alone, threads if self.unmatched else 1)
+        for number in wanted:
+            self._static(number)
+
     def final(self, frame: int) -> Float32Array:
-        """Return the depth (H, W) of a frame, m."""
+        """Return the depth (H, W) of a frame, m; frames that are prepared may be asked for on several threads."""
         mask = self.sequence.masks[frame]
         if self.config.static == "nearest_points":
             return self._by_nearest_points(frame, mask)
         offsets = self.config.averaged_offsets
-        self.made = {number: made for number, made in self.made.items() if number >= frame - max(offsets, default=0)}
         static, cue = self._static(frame)
         poses: FloatArray = self.scene["world_T_cam"]
         near = [frame + sign * offset for offset in offsets for sign in (-1, 1)]
@@ -192,6 +223,7 @@ class DenseMaps:
         return densify_frame(
             self._given(frame), mask, self.intrinsics[frame], self.control[frame],
             float(self.scene["log_scale"][frame]), float(self.scene["noise"][1]), self.config,
+            moving_only=self.config.static != "nearest_points",
         )  # fmt: skip
 
     def _static(self, frame: int) -> tuple[StaticDepth, Float32Array]:

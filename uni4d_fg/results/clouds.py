@@ -16,8 +16,7 @@ from uni4d_fg.reading import check_regular
 from uni4d_fg.results.run_folder import RunFolder
 
 _MAX_PLY_HEADER = 4096
-_PLAIN_BYTES, _NORMAL_BYTES = 3 * 4 + 3, 3 * 4
-"""Of a point with its color, and of its normal."""
+_AXES, _NORMAL, _CHANNELS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 
 
 def write_ply(path: Path, points: FloatArray, colors: ImageArray, normals: FloatArray | None = None) -> None:
@@ -31,7 +30,6 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray, normals: Float
 
     Raises:
         OutputError: If the arrays are no cloud, or the file cannot be written.
-        MissingDependencyError: If Open3D cannot be loaded.
     """
     if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
         raise OutputError(f"{path}: points {points.shape} and colors {colors.shape} must both be (N, 3)")
@@ -39,20 +37,16 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray, normals: Float
         raise OutputError(f"{path}: a point is NaN or infinite")
     if normals is not None and (normals.shape != points.shape or not np.isfinite(normals).all()):
         raise OutputError(f"{path}: normals {normals.shape} must be finite and as many as points {points.shape}")
-    if len(points) == 0:
-        _write_empty(path, with_normals=normals is not None)
-        return
-    open3d = import_open3d()
-    cloud = open3d.t.geometry.PointCloud()
-    cloud.point.positions = open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
-    cloud.point.colors = open3d.core.Tensor(np.ascontiguousarray(colors, dtype=np.uint8))
-    if normals is not None:
-        cloud.point.normals = open3d.core.Tensor(np.ascontiguousarray(normals, dtype=np.float32))
-    size = len(points) * (_PLAIN_BYTES + (_NORMAL_BYTES if normals is not None else 0))
-    quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
-    with atomic_path(path) as temporary, quiet:
-        if not open3d.t.io.write_point_cloud(str(temporary), cloud) or not _is_whole(temporary, size):
-            raise OutputError(f"cannot write {path}: Open3D failed; check free space and the folder's permissions")
+    numbers = _AXES if normals is None else _AXES + _NORMAL
+    stored = np.empty(len(points), [*((name, "<f4") for name in numbers), *((name, "u1") for name in _CHANNELS)])
+    columns = np.hstack([points, *(() if normals is None else (normals,)), colors])
+    for column, name in enumerate(numbers + _CHANNELS):
+        stored[name] = columns[:, column]
+    properties = [f"property float {name}" for name in numbers] + [f"property uchar {name}" for name in _CHANNELS]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header"]
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        stream.write(("\n".join(header) + "\n").encode("ascii"))
+        stream.write(stored.tobytes())
 
 
 def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
@@ -96,7 +90,6 @@ def write_clouds(
 
     Raises:
         OutputError: If a file cannot be written.
-        MissingDependencyError: If Open3D cannot be loaded.
     """
     write_ply(folder.static_cloud, *static)
     count = 0
@@ -104,19 +97,3 @@ def write_clouds(
         write_ply(folder.dynamic_cloud(frame), *cloud)
         count += 1
     return count
-
-
-def _is_whole(path: Path, size: int) -> bool:
-    """Tell whether ``size`` bytes follow a PLY's header: Open3D does not notice a full disk."""
-    content = path.read_bytes()
-    header, found, _ = content.partition(b"end_header\n")
-    return bool(found) and len(content) - len(header) - len(found) == size
-
-
-def _write_empty(path: Path, *, with_normals: bool) -> None:
-    axes = ("x", "y", "z", *(("nx", "ny", "nz") if with_normals else ()))
-    coordinates = "".join(f"property float {axis}\n" for axis in axes)
-    channels = "".join(f"property uchar {channel}\n" for channel in ("red", "green", "blue"))
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 0\n" + coordinates + channels + "end_header\n"
-    with atomic_path(path) as temporary:
-        temporary.write_text(header, encoding="ascii")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pickle
 from pathlib import Path
 
 import cv2
@@ -13,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 from sequence_samples import cut_file, write_image
 
 from uni4d_fg.errors import InputError
+from uni4d_fg.frontend.sequence import frames
 from uni4d_fg.frontend.sequence.decode import clean_depth, read_depth, read_image, read_mask
 from uni4d_fg.frontend.sequence.frames import DepthFolder, ImageFolder, MaskFolder, NpyDepth, no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource
@@ -38,6 +41,36 @@ def test_gray_alpha_and_16_bit_images(tmp_path: Path) -> None:
     image = read_image(tmp_path / "deep.png")
     assert image.dtype == np.uint8
     np.testing.assert_array_equal(image[0, :, 0], [0, 100, 255])
+
+
+def test_files_are_decoded_once_as_far_as_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (5, 4, 6, 3), dtype=np.uint8)
+    paths = tuple(tmp_path / f"{frame}.png" for frame in range(5))
+    for path, image in zip(paths, pixels, strict=True):
+        write_image(path, image)
+    decoded: list[str] = []
+
+    def counted(path: Path) -> np.ndarray:
+        decoded.append(path.name)
+        return read_image(path)
+
+    monkeypatch.setattr(frames, "read_image", counted)
+    monkeypatch.setattr(frames, "KEPT_BYTES", 3 * pixels[0].nbytes)
+    folder = ImageFolder(paths, size=(4, 6))
+    for _ in range(3):
+        for frame in range(5):
+            np.testing.assert_array_equal(folder[frame], pixels[frame, :, :, ::-1])
+            assert not folder[frame].flags.writeable
+    assert decoded[:5] == [path.name for path in paths]
+    assert "0.png" not in decoded[5:], "what was asked for first is kept"
+    assert folder._kept_bytes <= 3 * pixels[0].nbytes
+    write_image(paths[0], pixels[1])
+    os.utime(paths[0], ns=(1, 1))
+    np.testing.assert_array_equal(folder[0], pixels[1, :, :, ::-1])
+    again = pickle.loads(pickle.dumps(folder))
+    assert not again._kept
+    np.testing.assert_array_equal(again[4], folder[4])
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

@@ -96,11 +96,24 @@ def test_depth_edges_mark_both_sides_and_not_slopes() -> None:
     assert not depth_edges(step, 0.05).any()
 
 
-def test_voxels_average() -> None:
+@pytest.mark.parametrize("voxel", [0.05, 0.3, 1e-9])
+def test_voxels_are_those_of_open3d(rng: np.random.Generator, voxel: float) -> None:
     try:
-        import_open3d()
+        open3d = import_open3d()
     except MissingDependencyError as error:
         pytest.skip(str(error))
+    points, colors = rng.normal(size=(3000, 3)), rng.integers(0, 256, (3000, 3), dtype=np.uint8)
+    merged = merge_voxels(Cloud(points, colors), voxel)
+    fine = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    fine.colors = open3d.utility.Vector3dVector(colors.astype(np.float64))
+    coarse = fine.voxel_down_sample(max(voxel, 1e-7))  # it refuses smaller ones, which hold a point each as well
+    expected = np.asarray(coarse.points)
+    ours, theirs = (np.lexsort(np.round(values, 9).T) for values in (merged.points, expected))
+    np.testing.assert_allclose(merged.points[ours], expected[theirs], atol=1e-12)
+    np.testing.assert_array_equal(merged.colors[ours], np.rint(np.asarray(coarse.colors)[theirs]).astype(np.uint8))
+
+
+def test_voxels_average() -> None:
     points = np.array([[0.0, 0, 0], [0.002, 0, 0], [1.0, 0, 0]])
     colors = np.array([[0, 0, 0], [255, 100, 50], [9, 9, 9]], np.uint8)
     merged = merge_voxels(Cloud(points, colors), 0.1)

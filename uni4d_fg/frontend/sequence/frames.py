@@ -1,8 +1,9 @@
-"""Lazy per-frame sources: a file is opened when its frame is asked for, and nothing is kept."""
+"""Lazy per-frame sources: a file is opened when its frame is asked for, and little is kept."""
 
 from __future__ import annotations
 
 import operator
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -44,8 +45,14 @@ class LazyFrames(ABC, Generic[T]):
         return (self._read(frame) for frame in range(len(self)))
 
 
+KEPT_BYTES = 64 * 2**20
+"""Decoded frames that a source of files keeps: a run goes through a video some ten times."""
+
+
 class FileFrames(LazyFrames[T]):
     """One file per frame; every frame must have the size of the video's first image.
+
+    Frames are decoded once as long as they take no more than :data:`KEPT_BYTES`; what is handed out is read-only.
 
     Args:
         paths: T files.
@@ -62,11 +69,25 @@ class FileFrames(LazyFrames[T]):
 
     def __init__(self, paths: tuple[Path, ...], size: tuple[int, int] | None = None) -> None:
         self.paths = paths
+        self._kept: dict[int, tuple[tuple[int, int], T]] = {}
+        self._kept_bytes = 0
+        self._keeping = threading.Lock()
         self.size: tuple[int, int]
         if size is None:
             shape = self._decode(paths[0]).shape
             size = (shape[0], shape[1])
         self.size = size
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs: no frames."""
+        return {
+            name: value for name, value in self.__dict__.items() if name not in ("_kept", "_kept_bytes", "_keeping")
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Start with no frames kept."""
+        self.__dict__.update(state)
+        self._kept, self._kept_bytes, self._keeping = {}, 0, threading.Lock()
 
     @abstractmethod
     def _decode(self, path: Path) -> T:
@@ -80,6 +101,32 @@ class FileFrames(LazyFrames[T]):
         return str(self.paths[frame])
 
     def _read(self, frame: int) -> T:
+        version = _version(self.paths[frame])
+        with self._keeping:
+            kept = self._kept.get(frame)
+        if kept is not None and kept[0] == version:
+            return kept[1]
+        array = self._decoded(frame)
+        array.setflags(write=False)
+        if version is not None:
+            self._keep(frame, version, array)
+        return array
+
+    def _keep(self, frame: int, version: tuple[int, int], array: T) -> None:
+        """Keep a frame; where there is no room, in place of the one that came last.
+
+        A video is read from its start to its end again and again: whoever came first is asked for first.
+        """
+        with self._keeping:
+            gone = self._kept.pop(frame, None)
+            self._kept_bytes -= 0 if gone is None else gone[1].nbytes
+            while self._kept and self._kept_bytes + array.nbytes > KEPT_BYTES:
+                self._kept_bytes -= self._kept.popitem()[1][1].nbytes
+            if array.nbytes <= KEPT_BYTES:
+                self._kept[frame] = version, array
+                self._kept_bytes += array.nbytes
+
+    def _decoded(self, frame: int) -> T:
         array = self._decode(self.paths[frame])
         if array.shape[:2] != self.size:
             found = (array.shape[0], array.shape[1])
@@ -209,6 +256,29 @@ class ChangedFrames(LazyFrames[T]):
         return self.change(self.source[frame])
 
 
+class FramesInTurn(LazyFrames[T]):
+    """The frames of another source, read by one thread at a time: a source of somebody else may not allow more.
+
+    Args:
+        source: T frames.
+    """
+
+    def __init__(self, source: FrameSource[T]) -> None:
+        self.source = source
+        self._turn = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def where(self, frame: int) -> str:
+        """Return where the source has it from."""
+        return where_of(self.source, frame)
+
+    def _read(self, frame: int) -> T:
+        with self._turn:
+            return self.source[frame]
+
+
 def where_of(source: FrameSource[Any], frame: int) -> str:
     """Return where a source has a frame from, for messages."""
     return source.where(frame) if isinstance(source, LazyFrames) else f"frame {frame}"
@@ -241,6 +311,15 @@ class ConstantFrames(LazyFrames[T]):
 def no_masks(size: tuple[int, int], length: int) -> ConstantFrames[Int32Array]:
     """Return ``length`` label maps of ``size`` (height, width) that call everything static."""
     return ConstantFrames(np.zeros(size, dtype=np.int32), length)
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Return what changes with a file's content: its time, ns, and size; None if there is no such file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
 
 
 def _wrong_size(path: Path, found: tuple[int, int], expected: tuple[int, int], is_cue: bool = True) -> SequenceProblem:

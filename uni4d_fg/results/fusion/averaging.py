@@ -66,8 +66,8 @@ def average_over_frames(
             x, y, z = other_T_cam[:3, :3] @ points + other_T_cam[:3, 3:]
         with np.errstate(invalid="ignore", divide="ignore"):
             inverse = np.where(z > 0, 1.0 / z, np.float32(np.nan))
-            seen_u = np.nan_to_num(fx * x * inverse + cx, nan=_OUTSIDE, posinf=_OUTSIDE, neginf=_OUTSIDE)
-            seen_v = np.nan_to_num(fy * y * inverse + cy, nan=_OUTSIDE, posinf=_OUTSIDE, neginf=_OUTSIDE)
+            seen_u = _inside_or_out(fx * x * inverse + cx)
+            seen_v = _inside_or_out(fy * y * inverse + cy)
             inverse_sample = cv2.remap(
                 1.0 / other,
                 seen_u.reshape(height, width),
@@ -78,8 +78,14 @@ def average_over_frames(
             )
             difference = np.log(inverse / inverse_sample.reshape(-1))
             agrees = np.abs(difference) < max_disagreement
-        correction[agrees] += difference[agrees]
+        np.add(correction, difference, out=correction, where=agrees)
         count += agrees
         seeing += np.isfinite(difference)
     result: Float32Array = depth * np.exp(correction / (count + 1)).reshape(height, width)
     return Averaged(result, count.reshape(height, width), seeing.reshape(height, width))
+
+
+def _inside_or_out(position: Float32Array) -> Float32Array:
+    """Put what has no position outside of every image, in place."""
+    position[~np.isfinite(position)] = _OUTSIDE
+    return position

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.geometry.camera import unproject
 
@@ -48,6 +48,8 @@ def densify_frame(
     frame_log_scale: float,
     depth_sigma: float,
     config: FusionConfig,
+    *,
+    moving_only: bool = False,
 ) -> Float32Array:
     """Correct one frame's depth cue.
 
@@ -59,6 +61,7 @@ def densify_frame(
         frame_log_scale: The frame's own log-scale: used where an instance has too few control points.
         depth_sigma: Standard deviation of the cue's log depth, from the static scene.
         config: Fusion.
+        moving_only: Leave static pixels with nothing but the frame's log-scale.
 
     Returns:
         (H, W) float32 m, NaN exactly where the cue is missing.
@@ -70,14 +73,16 @@ def densify_frame(
     nodes = _grid(depth, intrinsics, config.stride)
     limit = config.max_scale_sigmas * depth_sigma
     plausible = np.isfinite(control.log_scale) & (np.abs(control.log_scale - frame_log_scale) <= limit)
-    for label in np.unique(mask).tolist():
+    labels = np.unique(mask[mask > 0] if moving_only else mask)
+    for label in labels.tolist():
         mine = np.flatnonzero(plausible & (control.instance == label))
         if len(mine) < config.min_control_points:
             continue
         anchors = unproject(intrinsics, control.uv[mine], control.cue[mine])
         scale = _smooth(anchors, control.log_scale[mine], config.smoothing)
-        field = _interpolate(nodes, anchors, scale, frame_log_scale, config.neighbors)
         pixels = mask == label
+        asked = np.where(_around(pixels, nodes.shape[:2])[..., None], nodes, np.nan)
+        field = _interpolate(asked, anchors, scale, frame_log_scale, config.neighbors)
         dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
         out[pixels] = depth[pixels] * np.exp(dense[pixels])
     return out
@@ -96,6 +101,17 @@ def _grid(depth: Float32Array, intrinsics: FloatArray, stride: int) -> FloatArra
     return result
 
 
+def _around(pixels: BoolArray, shape: tuple[int, ...]) -> BoolArray:
+    """Return the nodes (rows, columns) that the interpolation at some pixels (H, W) reads, and those beside them."""
+    at = []
+    for where, nodes, size in zip(np.nonzero(pixels), shape, pixels.shape, strict=True):
+        at.append(np.clip(np.floor((where + 0.5) * nodes / size - 0.5), 0, nodes - 1).astype(np.int64))
+    marked = np.zeros(shape, np.uint8)
+    marked[tuple(at)] = 1
+    # The node itself and the next one are read; rounding may take either for the first.
+    return np.asarray(cv2.dilate(marked, np.ones((5, 5), np.uint8)) > 0)
+
+
 def _smooth(anchors: FloatArray, scale: FloatArray, count: int) -> FloatArray:
     """Replace each scale by the median over its ``count`` nearest control points (itself included)."""
     k = min(count, len(anchors))
@@ -107,7 +123,10 @@ def _smooth(anchors: FloatArray, scale: FloatArray, count: int) -> FloatArray:
 
 
 def _interpolate(nodes: FloatArray, anchors: FloatArray, scale: FloatArray, default: float, count: int) -> Float32Array:
-    """Interpolate log-scales at grid nodes (rows, columns, 3) by inverse squared distance, (rows, columns)."""
+    """Interpolate log-scales at nodes (rows, columns, 3) by inverse squared distance, (rows, columns).
+
+    Nodes that are NaN have the default.
+    """
     field = np.full(nodes.shape[:2], default)
     known = np.isfinite(nodes).all(axis=-1)
     k = min(count, len(anchors))

@@ -13,6 +13,7 @@ from matplotlib.patheffects import Normal, Stroke
 from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, evenly_spread
+from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.results.pictures.figure import INK, MUTED, new_figure, save_figure, spread_frames, upright_axes
 from uni4d_fg.results.pictures.splatting import View, look_at, render
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -56,15 +57,20 @@ def draw_scene(
     columns = 2 if len(frames) > 1 else 1
     rows = -(-len(frames) // columns)
     figure = new_figure(6.4 * columns, 4.7 * rows)
-    for number, frame in enumerate(frames):
-        moving, moving_colors = dynamic(frame)
-        image, depth = render(
+    clouds = [dynamic(frame) for frame in frames]
+
+    def rendered(cloud: tuple[FloatArray, ImageArray]) -> tuple[ImageArray, FloatArray]:
+        moving, moving_colors = cloud
+        return render(
             view,
             np.concatenate((points, moving)),
             np.concatenate((colors, moving_colors)),
             np.concatenate((size, _sizes(moving))),
             _BACKGROUND,
         )
+
+    views = map_in_order(rendered, clouds, thread_count())
+    for number, (frame, (image, depth)) in enumerate(zip(frames, views, strict=True)):
         panel = figure.add_subplot(rows, columns, number + 1)
         panel.imshow(image)
         _draw_trails(panel, view, depth, trails[:, max(0, frame - trail_frames) : frame + 1], trail_colors)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, ImageArray
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
 from uni4d_fg.geometry.camera import project, world_to_camera
 
 _MAX_RADIUS_PX = 6
@@ -80,15 +80,15 @@ def render(
     fine = view.scaled(2)
     color, depth = _splat(fine, points, colors, point_size_m, smallest_px)
     shade = _edge_shading(depth, edge_strength)
-    image = np.where(np.isfinite(depth)[..., None], color * shade[..., None], np.array(background, dtype=np.float64))
-    height, width = view.image_size
-    image = image.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8), depth.reshape(height, 2, width, 2).min(axis=(1, 3))
+    image = np.where(np.isfinite(depth)[..., None], color * shade[..., None], np.array(background, dtype=np.float32))
+    image = 0.25 * (image[::2, ::2] + image[::2, 1::2] + image[1::2, ::2] + image[1::2, 1::2])
+    nearest = np.minimum(np.minimum(depth[::2, ::2], depth[::2, 1::2]), np.minimum(depth[1::2, ::2], depth[1::2, 1::2]))
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8), nearest
 
 
 def _splat(
     view: View, points: FloatArray, colors: ImageArray, point_size_m: FloatArray, smallest_px: float
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float32Array, FloatArray]:
     """Return color (H, W, 3) and depth (H, W) of the nearest disc in each pixel.
 
     Of the points whose middle is in one pixel the nearest is kept; its disc is then spread by a minimum filter, for
@@ -106,10 +106,8 @@ def _splat(
     bits = z.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
     key = (bits | np.arange(len(z), dtype=np.uint64)).view(np.float64)
     padded = height + 2 * margin, width + 2 * margin
-    order = np.argsort(-z, kind="stable")
     buffer = np.full(padded, np.inf)
-    # Of numbers that are put into one place the last one stays: the nearest.
-    buffer[row[order], column[order]] = key[order]
+    np.minimum.at(buffer.reshape(-1), row * padded[1] + column, key)
     filled = np.isfinite(buffer)
     steps = np.zeros(padded, np.int64)
     numbers = (buffer[filled].view(np.uint64) & np.uint64(0xFFFFFFFF)).astype(np.int64)
@@ -119,12 +117,18 @@ def _splat(
         here = filled & (steps == step)
         if reach < 1.0 or not here.any():
             continue
-        spread = cv2.erode(np.where(here, buffer, np.inf), _disc(reach), borderType=cv2.BORDER_REPLICATE)
-        nearest = np.minimum(nearest, spread)
+        # Nothing reaches farther than its disc: only the part around it is worked on.
+        rows, columns = (np.flatnonzero(here.any(axis=axis)) for axis in (1, 0))
+        part = (
+            slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
+            slice(max(columns[0] - margin, 0), columns[-1] + margin + 1),
+        )
+        spread = cv2.erode(np.where(here[part], buffer[part], np.inf), _disc(reach), borderType=cv2.BORDER_REPLICATE)
+        np.minimum(nearest[part], spread, out=nearest[part])
     nearest = nearest[margin:-margin, margin:-margin]
     filled = np.isfinite(nearest)
     index = (nearest[filled].view(np.uint64) & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    color, depth = np.zeros((height, width, 3)), np.full((height, width), np.inf)
+    color, depth = np.zeros((height, width, 3), np.float32), np.full((height, width), np.inf)
     color[filled], depth[filled] = colors[index], z[index]
     return color, depth
 
@@ -137,13 +141,17 @@ def _disc(radius: float) -> ImageArray:
     return np.asarray(inside, dtype=np.uint8)
 
 
-def _edge_shading(depth: FloatArray, strength: float) -> FloatArray:
+def _edge_shading(depth: FloatArray, strength: float) -> Float32Array:
     """Darken pixels that lie behind their neighbors (eye-dome lighting): factors (H, W) in (0, 1]."""
-    log_depth = np.where(np.isfinite(depth), np.log(np.where(np.isfinite(depth), depth, 1.0)), np.nan)
-    total = np.zeros(depth.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_depth = np.log(depth).astype(np.float32)
+    empty = ~np.isfinite(log_depth)
+    log_depth[empty] = np.nan
+    total = np.zeros(depth.shape, np.float32)
     for shift in (1, 3):
         for axis in (0, 1):
             for step in (shift, -shift):
                 behind = log_depth - np.roll(log_depth, step, axis=axis)
-                total += np.clip(np.nan_to_num(behind, nan=0.0), 0.0, 0.2)
-    return np.exp(-strength * total)
+                # Comparisons with NaN are false: beside nothing nothing is darkened.
+                np.add(total, np.fmin(np.fmax(behind, np.float32(0.0)), np.float32(0.2)), out=total)
+    return np.asarray(np.exp(-np.float32(strength) * total))
