@@ -40,6 +40,8 @@ struct TileInput {
   double* corner_tile;
 };
 void multiply_tiles(const LandmarkChunk& chunk, const TileInput& in);
+/// The same without the rows of poses, for cameras that are frozen but for their log-scales.
+void multiply_tiles_of_scales(const LandmarkChunk& chunk, const TileInput& in);
 
 /// E^T d of a chunk's landmarks: add to (64, 3).
 void apply_coupling(const LandmarkChunk& chunk, const double* coupling, const double* frame_step, double* out);

@@ -25,7 +25,8 @@ struct Places {
   const int* column_place;  ///< null: the landmark itself
 };
 
-/// tile (7, 8) += sum over the landmarks `shared` of A^T B with A, B (3, 8); row 7 of the product is not used.
+/// tile (7, 8) += sum over the landmarks `shared` of A^T B with A, B (3, 8); rows below First, and row 7, are not used.
+template <int First>
 UNI4D_FG_INLINE void multiply(std::uint64_t shared, const Places& at, double* tile) {
   Simd8 sums[kFrameColumns] = {};
   while (shared != 0) {
@@ -36,14 +37,37 @@ UNI4D_FG_INLINE void multiply(std::uint64_t shared, const Places& at, double* ti
     const double* b = at.columns + static_cast<std::size_t>(column) * kWidth;
     for (int k = 0; k < 3; ++k) {
       const Simd8 right = load_simd8(b + k * kSimd8Width);
-      for (int row = 0; row < kFrameColumns; ++row) sums[row] += a[k * kSimd8Width + row] * right;
+      for (int row = First; row < kFrameColumns; ++row) sums[row] += a[k * kSimd8Width + row] * right;
     }
   }
-  for (int row = 0; row < kFrameColumns; ++row)
+  for (int row = First; row < kFrameColumns; ++row)
     store_simd8(load_simd8(tile + row * kSimd8Width) + sums[row], tile + row * kSimd8Width);
 }
 
 constexpr std::size_t kTile = kFrameColumns * kSimd8Width;
+
+template <int First>
+UNI4D_FG_INLINE void multiply_rows(const LandmarkChunk& chunk, const TileInput& in) {
+  const int* frames = chunk.frames.data();
+  const std::uint64_t* seen = chunk.seen.data();
+  const std::size_t count = chunk.frames.size();
+  std::uint64_t any = 0;
+  for (std::size_t i = 0; i < count; ++i) {
+    const auto frame = static_cast<std::size_t>(frames[i]);
+    const int* place = in.place + i * kChunkLandmarks;
+    any |= seen[i];
+    multiply<First>(seen[i], {in.whitened, place, in.border, nullptr}, in.border_tiles + frame * kTile);
+    for (std::size_t j = i; j < count; ++j) {
+      const std::uint64_t shared = seen[i] & seen[j];
+      if (shared == 0) continue;
+      double* tile = in.tiles + static_cast<std::size_t>(in.tile_begin[frame] + frames[j] - frames[i]) * kTile;
+      multiply<First>(shared, {in.whitened, place, in.whitened, in.place + j * kChunkLandmarks}, tile);
+    }
+  }
+  int own[kChunkLandmarks];
+  for (int i = 0; i < kChunkLandmarks; ++i) own[i] = i;
+  multiply<0>(any, {in.border, own, in.border, nullptr}, in.corner_tile);
+}
 
 }  // namespace
 
@@ -66,25 +90,11 @@ UNI4D_FG_WIDE_CLONES void whiten_pairs(const LandmarkChunk& chunk, const double*
 }
 
 UNI4D_FG_WIDE_CLONES void multiply_tiles(const LandmarkChunk& chunk, const TileInput& in) {
-  const int* frames = chunk.frames.data();
-  const std::uint64_t* seen = chunk.seen.data();
-  const std::size_t count = chunk.frames.size();
-  std::uint64_t any = 0;
-  for (std::size_t i = 0; i < count; ++i) {
-    const auto frame = static_cast<std::size_t>(frames[i]);
-    const int* place = in.place + i * kChunkLandmarks;
-    any |= seen[i];
-    multiply(seen[i], {in.whitened, place, in.border, nullptr}, in.border_tiles + frame * kTile);
-    for (std::size_t j = i; j < count; ++j) {
-      const std::uint64_t shared = seen[i] & seen[j];
-      if (shared == 0) continue;
-      double* tile = in.tiles + static_cast<std::size_t>(in.tile_begin[frame] + frames[j] - frames[i]) * kTile;
-      multiply(shared, {in.whitened, place, in.whitened, in.place + j * kChunkLandmarks}, tile);
-    }
-  }
-  int own[kChunkLandmarks];
-  for (int i = 0; i < kChunkLandmarks; ++i) own[i] = i;
-  multiply(any, {in.border, own, in.border, nullptr}, in.corner_tile);
+  multiply_rows<0>(chunk, in);
+}
+
+UNI4D_FG_WIDE_CLONES void multiply_tiles_of_scales(const LandmarkChunk& chunk, const TileInput& in) {
+  multiply_rows<kFrameColumns - 1>(chunk, in);
 }
 
 UNI4D_FG_WIDE_CLONES void apply_coupling(const LandmarkChunk& chunk, const double* coupling, const double* frame_step,

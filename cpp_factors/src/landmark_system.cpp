@@ -42,6 +42,8 @@ LandmarkSystem::LandmarkSystem(LandmarkProblem problem, int threads)
       num_reprojection_(static_cast<int>(problem_.reprojection.size())),
       num_depth_(static_cast<int>(problem_.depth.size())),
       plan_(plan_landmarks(problem_, threads)) {
+  for (std::size_t i = 0; i < problem_.columns.size(); ++i)
+    poses_free_ = poses_free_ || (problem_.columns[i] >= 0 && i % kFrameColumns < kFrameColumns - 1);
   problem_.reprojection.clear();
   problem_.depth.clear();
   coupling_.resize(static_cast<std::size_t>(plan_.num_pairs) * kWidth);
@@ -262,7 +264,8 @@ bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBo
   double* tiles = tiles_[w].data();
   const auto frames = static_cast<std::size_t>(problem_.num_frames);
   double* border_tiles = tiles + static_cast<std::size_t>(tile_begin_[w][frames]) * kTile;
-  landmark_passes::multiply_tiles(
+  const auto multiply = poses_free_ ? landmark_passes::multiply_tiles : landmark_passes::multiply_tiles_of_scales;
+  multiply(
       chunk, {whitened, border, place, tile_begin_[w].data(), tiles, border_tiles, border_tiles + frames * kTile});
   return true;
 }

@@ -117,6 +117,7 @@ class LandmarkSystem {
   int threads_;
   std::vector<Kernel> reprojection_kernels_, depth_kernels_;
   int num_reprojection_ = 0, num_depth_ = 0;
+  bool poses_free_ = false;  ///< any entry of any pose
   LandmarkPlan plan_;
   /// (pairs, 3, 8) rows of E^T of a pair: six pose entries, log-scale, 0.
   AlignedDoubles coupling_;
