@@ -52,6 +52,17 @@ def test_help_names_every_verb(cli: Run) -> None:
         assert cli(verb, "--help")[0] == 0
 
 
+def test_help_has_no_types_of_python(cli: Run) -> None:
+    for verb in ("export", "reconstruct", "render", "benchmark", "stream"):
+        code, out, _ = cli(verb, "--help")
+        assert code == 0
+        options = out.split("Options", 1)[1]
+        for word in ("<bool>", "<path>", "<int", "<list", "<str"):
+            assert word not in options, (verb, word)
+    out = cli("export", "--help")[1]
+    assert all(name in out for name in ("colmap", "gsplat", "ply-frames", "uni4d"))
+
+
 def test_version(cli: Run) -> None:
     code, out, _ = cli("--version")
     assert (code, out.split()[0]) == (0, "uni4d-fg")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sys
 import traceback
+from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -68,15 +70,47 @@ def options(
     log_to_stderr(verbose)
 
 
+_TYPE_NAMES = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
+_SHORT = 16
+"""Characters of a list of choices that fit into the column of types."""
+
+
 def _tidy_help(command: Any) -> None:
-    """Tidy the help of a command and of those below it: flags have no type, paragraphs no line breaks."""
+    """Tidy the help of a command and of those below it: short names of types, none of flags, no breaks of lines."""
     if command.help:
         command.help = "\n\n".join(" ".join(part.split()) for part in command.help.split("\n\n"))
     for parameter in command.params:
-        if getattr(parameter, "is_flag", False):
-            parameter.metavar = ""
+        _tidy_parameter(parameter)
+    get_help_option = command.get_help_option
+
+    def tidy_help_option(context: Any) -> Any:
+        option = get_help_option(context)
+        if option is not None:
+            option.metavar = ""
+        return option
+
+    command.get_help_option = tidy_help_option
     for below in getattr(command, "commands", {}).values():
         _tidy_help(below)
+
+
+def _tidy_parameter(parameter: Any) -> None:
+    """Give an option a short name of its type; choices that are long go into its help."""
+    if getattr(parameter, "is_flag", False):
+        parameter.metavar = ""
+    # Of typer's own classes; without it, as in other versions, typer's names stay.
+    kind = getattr(getattr(parameter, "type_descriptor", None), "annotation", None)
+    if parameter.metavar is not None or not parameter.opts[0].startswith("-"):
+        return
+    kind = next((one for one in get_args(kind) if one is not type(None)), kind)
+    if not (isinstance(kind, type) and issubclass(kind, Enum)):
+        parameter.metavar = _TYPE_NAMES.get(kind) if isinstance(kind, type) else None
+        return
+    names = [str(choice.value) for choice in kind]
+    parameter.metavar = "|".join(names)
+    if len(parameter.metavar) > _SHORT:
+        parameter.metavar = "NAME"
+        parameter.help = f"{(parameter.help or '').rstrip('.')}: {', '.join(names)}."
 
 
 def run(arguments: list[str]) -> int:

@@ -62,6 +62,9 @@ def reconstruct(
     layout: options.Layout = LayoutChoice.auto,
     depth_gt_scale: options.DepthScale = 1000.0,
     known_intrinsics: options.KnownIntrinsics = False,
+    keep_cues: Annotated[
+        bool, typer.Option("--keep-cues", help="Keep cues that only led to others; --resume makes them again else.")
+    ] = False,
     quiet: options.Quiet = False,
     json: options.Json = False,
 ) -> None:
@@ -75,6 +78,7 @@ def reconstruct(
     """
     from uni4d_fg.cli import shots
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.cues.intermediate import drop_intermediate
     from uni4d_fg.frontend.measurements.imu import read_imu
     from uni4d_fg.pipeline.inertial import check_goes_with_imu
     from uni4d_fg.pipeline.measurements import MeasurementFiles
@@ -111,10 +115,13 @@ def reconstruct(
         )
         sequence, report = run_cues(video, plan, folder, settings, quiet=quiet, forecast=forecast)
         chosen = settings if report is None or report.settings is None else report.settings
-        return run_pipeline(
+        summary = run_pipeline(
             sequence, folder, chosen, resume=again, quiet=quiet, cues=report, measurements=files, imu=samples,
             warnings=warnings, forecast=forecast, workers=work,
-        ), sequence  # fmt: skip
+        )  # fmt: skip
+        if not keep_cues:
+            drop_intermediate(folder / CUE_FOLDER)
+        return summary, sequence
 
     with run_lock(run):
         prepare_run_folder(run, source, resume=resume, overwrite=overwrite)

@@ -23,7 +23,9 @@ from uni4d_fg import optional
 from uni4d_fg.cli import main
 from uni4d_fg.errors import ConfigError, MissingDependencyError
 from uni4d_fg.results.view.content import Limits, RunClouds
+from uni4d_fg.results.view.panel import Panel
 from uni4d_fg.results.view.server import check_address, is_own_page, viewer_server
+from uni4d_fg.results.view.shown import Shown
 from uni4d_fg.results.view.viewer import Viewer
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'uni4d-fg[view]'")
@@ -256,6 +258,26 @@ def test_a_browser_shows_the_scene_and_follows_the_slider(finished_run: Path) ->
     assert errors == []
     outside = [url for url in requested if not url.startswith((f"http://127.0.0.1:{port}", "data:", "blob:"))]
     assert outside == []
+
+
+def test_a_phone_shows_the_scene_first_and_the_panel_when_asked() -> None:
+    port = free_port()
+    phone = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
+    with viewer_server("127.0.0.1", port, "a run") as server, browser_page(**phone) as page:
+        Panel(server, 5, "a run", 15.0, Shown())
+        page.set_default_timeout(120_000)
+        page.goto(f"http://127.0.0.1:{port}")
+        control = page.get_by_text("Frames per second")
+        control.wait_for(state="attached")
+        # Long enough for the panel to have opened, if nothing had closed it.
+        time.sleep(2.0)
+        assert not control.is_visible()
+        handle = page.locator('div[style*="cursor: pointer"]').first
+        box = handle.bounding_box()
+        assert box is not None
+        assert box["y"] > 0.9 * 844
+        handle.click()
+        control.wait_for(state="visible")
 
 
 def test_notes_reach_the_panel(finished_run: Path, tmp_path: Path) -> None:

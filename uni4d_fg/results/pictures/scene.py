@@ -21,7 +21,9 @@ from uni4d_fg.slam.reconstruction import Reconstruction
 _BACKGROUND = (247, 248, 250)
 _PANEL = (450, 640)
 _ELEVATION_DEG = 22.0
-_MARGIN = 0.05
+_MARGIN = 0.04
+_OUTSIDE = 0.15
+"""Percent of a cloud's points beyond each side of the picture: strays, which would make the rest small."""
 _MAX_STATIC_POINTS = 400_000
 _MAX_TRAILS = 160
 _HIDDEN_BY = 1.06
@@ -43,7 +45,7 @@ def draw_scene(
         reconstruction: Cameras and dynamic trajectories.
         static: Points (N, 3), meters, and RGB (N, 3) of the static cloud.
         dynamic: Returns the same for the moving instances of a frame.
-        panels: Number of times shown, evenly spread.
+        panels: Number of times shown, evenly spread over the frames in which something moves.
         trail_frames: Length of the moving points' trails, frames.
 
     Raises:
@@ -52,7 +54,7 @@ def draw_scene(
     points, colors = _thin(*static)
     view = _view(reconstruction, points)
     size = _sizes(points)
-    frames = spread_frames(reconstruction.num_frames, panels)
+    frames = _frames(reconstruction, panels)
     trails, trail_colors = _trails(reconstruction)
     columns = 2 if len(frames) > 1 else 1
     rows = -(-len(frames) // columns)
@@ -80,6 +82,14 @@ def draw_scene(
         panel.set_axis_off()
         panel.set_title(f"frame {frame}", loc="left", fontsize=9, color=MUTED)
     save_figure(path, figure)
+
+
+def _frames(reconstruction: Reconstruction, count: int) -> list[int]:
+    """Return up to ``count`` frames, spread over those that show at least half of the usual number of moving points."""
+    seen = reconstruction.dynamic_observed.sum(axis=0)
+    usual = np.median(seen[seen > 0]) if (seen > 0).any() else 0.0
+    there = np.flatnonzero(seen >= 0.5 * usual)
+    return sorted({int(there[k]) for k in spread_frames(len(there), count)})
 
 
 def _thin(points: FloatArray, colors: ImageArray) -> tuple[FloatArray, ImageArray]:
@@ -124,7 +134,7 @@ def _framed(world_T_cam: FloatArray, clouds: list[FloatArray], cameras: FloatArr
     height, width = _PANEL
     unit = View(world_T_cam, np.array([1.0, 1.0, 0.0, 0.0]), _PANEL)
     corners = []
-    for points, outside in [*((cloud, 1.0) for cloud in clouds), (cameras, 0.0)]:
+    for points, outside in [*((cloud, _OUTSIDE) for cloud in clouds), (cameras, 0.0)]:
         uv, _ = unit.project(points)
         uv = uv[np.isfinite(uv).all(axis=1)]
         if len(uv):

@@ -3,16 +3,16 @@
 // Clouds come in chunks whose points are ordered so that any first part of them covers the chunk evenly
 // (uni4d_fg/results/chunks.py). Here less of a chunk is drawn where its points are smaller than a pixel or the
 // chunk is out of sight, and, while the picture changes, as much as the machine draws at the wanted rate; what is left
-// out is made up for by larger points. A picture that stands still gets several times as much. Where a name that this
-// relies on is not found, everything is drawn.
+// out is made up for by larger points. A picture that stands still gets several times as much, and more every time it is
+// drawn, up to what takes most of a second. Where a name that this relies on is not found, everything is drawn.
 (() => {
   if (window.uni4dDetail || !window.WebGL2RenderingContext) return;
-  const TARGET_MS = 38, TOUCH_MS = 300, STILL_FACTOR = 6, FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24;
+  const TARGET_MS = 38, TOUCH_MS = 300, STILL_FACTOR = 6, STILL_MOST = 20, FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24;
   const state = (window.uni4dDetail = { budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false });
   const gl2 = WebGL2RenderingContext.prototype;
   const NAMES = ["scale", "modelViewMatrix", "projectionMatrix"];
   const located = new WeakMap(), values = new WeakMap();
-  let program = null, asked = 0, shown = 0, moving = false, begun = false, before = 0, drewBefore = false, touched = -1e9;
+  let program = null, still = 0, asked = 0, shown = 0, moving = false, begun = false, before = 0, drewBefore = false, touched = -1e9;
 
   const wrap = (name, make) => { const inner = gl2[name]; gl2[name] = make(inner); return inner; };
   wrap("useProgram", (inner) => function (next) { program = next; return inner.call(this, next); });
@@ -51,11 +51,12 @@
       begun = true;
       // viser draws once a second when nothing changes, and frame after frame when something does.
       moving = drewBefore || performance.now() - touched < TOUCH_MS;
+      still = moving ? 0 : still + 1;
     }
     const part = worth(view, projection, scale);
     if (part === 0) return;
     asked += part * count;
-    const budget = moving ? state.budget : STILL_FACTOR * state.budget;
+    const budget = moving ? state.budget : Math.min(STILL_FACTOR * 2 ** (still - 1), STILL_MOST) * state.budget;
     const fraction = part * Math.min(1, budget / Math.max(state.wanted, 1));
     const number = Math.max(1, Math.ceil(fraction * count));
     shown += number;

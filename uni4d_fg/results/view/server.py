@@ -127,6 +127,10 @@ def viewer_server(host: str, port: int, title: str) -> Iterator[Any]:
     # viser announces itself and its end on standard output, which is for results.
     with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+    # Points are not lit. viser's own environment would keep the picture dark until it is decoded and filtered, which
+    # takes seconds without a graphics card.
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(cast_shadow=False)
     try:
         yield server
     finally:
