@@ -87,7 +87,10 @@ def viewer_pictures(run: Path, folder: Path, *, frame: int = 20, patience_s: flo
                     except Exception:
                         time.sleep(0.5)
                 page.wait_for_function("window.uni4dDetail && window.uni4dDetail.wanted > 200000")
-                page.locator(".mantine-Notification-closeButton").click()
+                # The note that there is no graphics card; a click by the mouse would wait for a picture at rest.
+                page.evaluate(
+                    "document.querySelectorAll('.mantine-Notification-closeButton').forEach((b) => b.click())"
+                )
                 for _ in range(frame):
                     page.keyboard.press("ArrowRight")
                 page.wait_for_function(f"document.body.textContent.includes('frame {frame} of')")

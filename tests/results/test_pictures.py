@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -9,12 +10,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from uni4d_fg.errors import OutputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.geometry import se3
-from uni4d_fg.results.pictures import draw_depth_strip, draw_scene, draw_trajectory
+from uni4d_fg.results.pictures import draw_depth_strip, draw_scene, draw_trajectory, trajectory
 from uni4d_fg.results.pictures.figure import spread_frames, upright_axes
+from uni4d_fg.results.pictures.scene import times_of_the_subject
 from uni4d_fg.results.pictures.splatting import View, look_at, render
 from uni4d_fg.slam.reconstruction import Reconstruction
 
@@ -155,3 +158,31 @@ def test_frames_are_spread() -> None:
     assert spread_frames(1, 4) == [0]
     assert spread_frames(30, 4) == [0, 10, 19, 29]
     assert spread_frames(3, 5) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("extent", [0.005, 0.03, 0.3, 0.9, 12.0, 1234.0])
+def test_ticks_of_the_camera_path_do_not_overlap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extent: float
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(trajectory, "save_figure", lambda path, figure: drawn.append(figure))
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, :3, 3] = extent * np.random.default_rng(0).random((20, 3))
+    draw_trajectory(tmp_path / "path.png", poses)
+    (figure,) = drawn
+    figure.canvas.draw()
+    for panel in figure.axes[:2]:
+        for labels, low, high in ((panel.get_xticklabels(), "x0", "x1"), (panel.get_yticklabels(), "y0", "y1")):
+            boxes = [label.get_window_extent() for label in labels if label.get_text()]
+            spans = sorted((getattr(box, low), getattr(box, high)) for box in boxes)
+            assert len(spans) >= 3
+            assert all(second[0] > first[1] for first, second in itertools.pairwise(spans))
+
+
+def test_the_scene_is_shown_while_the_subject_is_there() -> None:
+    observed = np.zeros((10, 30), bool)
+    observed[:, 5:20] = True
+    observed[:3, 20:25] = True
+    assert times_of_the_subject(observed, 4) == [5, 10, 14, 19]
+    assert times_of_the_subject(np.zeros((0, 30), bool), 4) == [0, 10, 19, 29]
+    assert times_of_the_subject(observed[:, :1], 4) == [0]

@@ -54,7 +54,7 @@ def draw_scene(
     points, colors = _thin(*static)
     view = _view(reconstruction, points)
     size = _sizes(points)
-    frames = _frames(reconstruction, panels)
+    frames = times_of_the_subject(reconstruction.dynamic_observed, panels)
     trails, trail_colors = _trails(reconstruction)
     columns = 2 if len(frames) > 1 else 1
     rows = -(-len(frames) // columns)
@@ -84,9 +84,14 @@ def draw_scene(
     save_figure(path, figure)
 
 
-def _frames(reconstruction: Reconstruction, count: int) -> list[int]:
-    """Return up to ``count`` frames, spread over those that show at least half of the usual number of moving points."""
-    seen = reconstruction.dynamic_observed.sum(axis=0)
+def times_of_the_subject(observed: BoolArray, count: int) -> list[int]:
+    """Return up to ``count`` frames, spread over those that show at least half of the usual number of moving points.
+
+    Args:
+        observed: (K, T) whether each moving point was seen in each frame.
+        count: Number of frames.
+    """
+    seen = observed.sum(axis=0)
     usual = np.median(seen[seen > 0]) if (seen > 0).any() else 0.0
     there = np.flatnonzero(seen >= 0.5 * usual)
     return sorted({int(there[k]) for k in spread_frames(len(there), count)})
