@@ -1,6 +1,6 @@
 """How far each method gets as scenes become harder: cameras and moving points against one difficulty at a time.
 
-    python benchmarks/difficulty.py --out runs/difficulty [--workers 2] [--only lm] [--page docs/figures_difficulty.md]
+    python benchmarks/difficulty.py --out runs/difficulty [--workers 2] [--only adam] [--page docs/figures.md]
 
 Small scenes (12 frames of 160 x 120 px, 384 tracks), as Adam takes minutes for larger ones. One scene is the base;
 along each axis one number of it changes. Runs that are finished are not done again; the page and the curves are made of
@@ -92,6 +92,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/difficulty"))
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", default="", help="methods whose names contain this")
+    parser.add_argument("--scene", nargs="+", help="these scenes only")
     parser.add_argument("--page", type=Path, help="where the page goes; pictures go to images/ beside it")
     asked = parser.parse_args()
     out = asked.out.resolve()
@@ -99,7 +100,11 @@ def main() -> None:
     root = make_scenes(out / "scenes", levels)
     tasks = [task(root, out, level, method) for method in METHODS for level in levels if belongs(level, method)]
     tasks += [task(root, out, level, method) for level in levels if level.name in _ABLATED for method in ablations()]
-    wanted = [t for t in tasks if asked.only.lower() in t.configuration.name.lower()]
+    wanted = [
+        t
+        for t in tasks
+        if asked.only.lower() in t.configuration.name.lower() and (asked.scene is None or t.video in asked.scene)
+    ]
     execute = one_after_the_other() if asked.workers == 1 else on_workers(WorkerOptions(workers=asked.workers))
     for result, was_there in run_tasks(wanted, execute):
         if not was_there:

@@ -145,6 +145,15 @@ def numbers_without_gap(paths: tuple[Path, ...]) -> None:
         )
 
 
+def images_of_truth(paths: tuple[Path, ...], truth: Path, suffix: str) -> None:
+    """Raise InputError if a frame at either end has truth in a folder, ``NAME.suffix``, but no image."""
+    absent = sorted({path.stem for path in truth.glob(f"*{suffix}")} - {path.stem for path in paths})
+    if absent:
+        raise SequenceProblem(
+            paths[0].parent, f"lacks {some_of(absent)}, of which there is truth in {truth}", "unpack the archive again"
+        )
+
+
 def make_video(name: str, root: Path, paths: tuple[Path, ...], timestamps: FloatArray, truth: GroundTruth) -> Video:
     """Return a video of image files without cues; the first image is decoded.
 

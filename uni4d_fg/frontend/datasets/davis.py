@@ -18,7 +18,14 @@ import numpy as np
 from PIL import Image
 
 from uni4d_fg.arrays import Int32Array
-from uni4d_fg.frontend.datasets.base import Dataset, DatasetCard, images_of, make_video, names_of_folders
+from uni4d_fg.frontend.datasets.base import (
+    Dataset,
+    DatasetCard,
+    images_of,
+    images_of_truth,
+    make_video,
+    names_of_folders,
+)
 from uni4d_fg.frontend.sequence.decode import MAX_PIXELS
 from uni4d_fg.frontend.sequence.frames import FileFrames
 from uni4d_fg.frontend.sequence.model import GroundTruth, Video
@@ -57,6 +64,7 @@ class Davis(Dataset):
         annotated = base / "Annotations" / "480p" / video
         if not annotated.is_dir():
             return opened
+        images_of_truth(paths, annotated, ".png")
         masks = PaletteMasks(
             tuple(self.need_file(annotated / f"{path.stem}.png", root) for path in paths), opened.image_size
         )

@@ -23,6 +23,7 @@ from uni4d_fg.frontend.datasets.base import (
     first_read,
     frame_number,
     images_of,
+    images_of_truth,
     make_video,
     names_of_folders,
     numbers_without_gap,
@@ -89,6 +90,7 @@ class Sintel(Dataset):
         depth, cameras, moving = (base / name / video for name in ("depth", "camdata_left", "dynamic_label_perfect"))
         self.need_folder(depth, root)
         self.need_folder(cameras, root)
+        images_of_truth(paths, depth, ".dpt")
         names = [path.stem for path in paths]
         matrices, poses = self._cameras(tuple(self.need_file(cameras / f"{n}.cam", root) for n in names))
         depth_paths = tuple(self.need_file(depth / f"{n}.dpt", root) for n in names)
