@@ -46,7 +46,8 @@ def write_tables(
     Raises:
         OutputError: If a file cannot be written.
     """
-    for table in tables:
+    short = short_table(facts.title, tables)
+    for table in tables if short is None else [short, *tables]:
         for suffix, text in (("md", table.markdown()), ("tex", table.latex()), ("csv", table.comma_separated())):
             atomic_write_text(folder / "tables" / f"{table.name}.{suffix}", text)
     page = _page(facts, tables, methods, [path.relative_to(folder) for path in pictures])
