@@ -144,7 +144,8 @@ def make_scenes(root: Path, levels: Sequence[Level]) -> Path:
         noise = CueNoise(**level.noise)  # type: ignore[arg-type]
         fields = {
             "num_frames": 12, "height": 120, "width": 160, "focal": 150.0, "margin_px": 3.0, "grid_columns": 16,
-            "grid_rows": 12, "query_interval": 6, "noise": noise, "render_images": level.built_in or level.render, **level.scene,
+            "grid_rows": 12, "query_interval": 6, "noise": noise, "render_images": level.built_in or level.render,
+            **level.scene,
         }  # fmt: skip
         sequence = make_synthetic_sequence(SyntheticSceneConfig(**fields))  # type: ignore[arg-type]
         if level.blur_px:
@@ -191,11 +192,11 @@ def write_page(found: dict[tuple[str, str], TaskResult], root: Path, page: Path,
 
 
 _HEAD = (
-    "Made by `benchmarks/difficulty.py`. Scenes of 12 frames of 160 x 120 px with 384 tracks and the default noise (0.5",
-    "px, depth flicker 4 %, smooth depth error 2 %, outliers 2 %, focal length 5 % off), one difficulty at a time. They",
-    "are this small because Adam takes minutes for larger ones; it was run on some of them only. The camera's path is 0.3",
-    "m long at 15 frames a second, so that errors of points are mostly the scale that the Sim(3) of so short a path",
-    "gives: compare methods, not scenes.",
+    "Made by `benchmarks/difficulty.py`. Scenes of 12 frames of 160 x 120 px with 384 tracks and the default noise",
+    "(0.5 px, depth flicker 4 %, smooth depth error 2 %, outliers 2 %, focal length 5 % off), one difficulty at a time.",
+    "They are this small because Adam takes minutes for larger ones; it was run on some of them only. The camera's path",
+    "is 0.3 m long at 15 frames a second, so that errors of points are mostly the scale that the Sim(3) of so short a",
+    "path gives: compare methods, not scenes.",
 )
 
 
