@@ -193,9 +193,9 @@ def write_page(found: dict[tuple[str, str], TaskResult], root: Path, page: Path,
 
 _HEAD = (
     "Made by `benchmarks/difficulty.py`. Scenes of 12 frames of 160 x 120 px with 384 tracks and the default noise",
-    "(0.5 px, depth flicker 4 %, smooth depth error 2 %, outliers 2 %, focal length 5 % off), one difficulty at a time.",
-    "They are this small because Adam takes minutes for larger ones; it was run on some of them only. The camera's path",
-    "is 0.3 m long at 15 frames a second, so that errors of points are mostly the scale that the Sim(3) of so short a",
+    "(0.5 px, depth flicker 4 %, smooth depth error 2 %, outliers 2 %, focal length 5 % off), one difficulty each.",
+    "They are this small because Adam takes minutes for larger ones; it was run on some of them only. The path of the",
+    "camera is 0.3 m long at 15 frames a second: errors of points are mostly the scale that the Sim(3) of so short a",
     "path gives: compare methods, not scenes.",
 )
 

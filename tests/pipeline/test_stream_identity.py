@@ -83,6 +83,13 @@ def test_a_stream_warns_of_what_a_batch_run_warns_of() -> None:
     assert scene_warnings(given, given, poses, points) == []
     assert "moved by 159 %" in scene_warnings(given, given * [415 / 160, 1, 1, 1], poses, points)[0]
     assert "no landmarks" in scene_warnings(given, given, poses, np.zeros((0, 3)))[0]
+    covariance = np.zeros((3, 6, 6))
+    path = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+    for part, expected in ((0.03, []), (0.06, ["camera positions are uncertain by 6 % of the path's length"])):
+        covariance[1:, 3:, 3:] = np.diag([0.0, (part * path) ** 2, 0.0])
+        found = scene_warnings(given, given, poses, points, covariance)
+        assert [text.split(":")[0] for text in found] == expected
+    assert scene_warnings(given, given, poses, points, np.full((3, 6, 6), np.nan)) == []
     assert "moves by only 0.00 %" in scene_warnings(given, given, np.tile(np.eye(4), (3, 1, 1)), points)[0]
 
 

@@ -20,6 +20,7 @@ from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.steps import STOPPED
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
+from uni4d_fg.pipeline.warnings import focal_warnings
 from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
 from uni4d_fg.slam.lens.tracks import ideal_tracks, unzoomed_tracks
 
@@ -134,11 +135,14 @@ def lens_step(
     zoom = found.zoom
     if zoom is not None and zoom.zoom is not None:
         arrays["zoom"] = zoom.zoom
+    # A pinhole's move on in bundle adjustment, which has its own look at them; those of a zoom are no single ones.
+    alone = not found.lens.is_pinhole and "zoom" not in arrays
+    doubts = focal_warnings(sequence.intrinsics, found.intrinsics[:2]) if alone else []
     summary: dict[str, Any] = {
         "solves": [solve_dict(solve) for solve in found.solves],
         "facts": found.facts(),
         "camera_model": found.lens.model,
-        "warnings": [] if zoom is None else list(zoom.warnings),
+        "warnings": [*doubts, *([] if zoom is None else zoom.warnings)],
         "candidates": [
             {
                 "camera_model": c.lens.model,

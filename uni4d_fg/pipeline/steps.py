@@ -196,7 +196,9 @@ def bundle_summary(
         f"{len(landmarks)} landmarks, {num_observations} observations, "
         f"fx {fx:.1f} fy {fy:.1f} px, noise {pixel:.2f} px, depth {100 * relative:.1f} %"
     ]
-    warnings = scene_warnings(sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks)
+    warnings = scene_warnings(
+        sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"]
+    )
     return {"solves": solves, "dropped": dropped, "facts": facts, "warnings": warnings}
 
 

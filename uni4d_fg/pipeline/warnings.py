@@ -9,10 +9,24 @@ from uni4d_fg.arrays import FloatArray
 _MAX_FOCAL_CHANGE = 0.15
 _MIN_BASELINE = 0.01
 """Of the scene's depth."""
+_MAX_UNCERTAINTY = 0.05
+"""Root mean square of the positions' sigmas, of the path's length: a path that may be off by a twentieth of itself."""
+
+
+def focal_warnings(given_intrinsics: FloatArray, focal_px: FloatArray) -> list[str]:
+    """Return a sentence if focal lengths (..., 2), px, are far from the given intrinsics (4,)."""
+    change = float(np.abs(focal_px / given_intrinsics[:2] - 1.0).max())
+    if change <= _MAX_FOCAL_CHANGE:
+        return []
+    return [f"the focal lengths moved by {100 * change:.0f} % from the given ones"]
 
 
 def scene_warnings(
-    given_intrinsics: FloatArray, intrinsics: FloatArray, world_T_cam: FloatArray, landmarks: FloatArray
+    given_intrinsics: FloatArray,
+    intrinsics: FloatArray,
+    world_T_cam: FloatArray,
+    landmarks: FloatArray,
+    pose_covariance: FloatArray | None = None,
 ) -> list[str]:
     """Return one sentence for everything that makes a static scene doubtful.
 
@@ -21,11 +35,9 @@ def scene_warnings(
         intrinsics: (4,) that it ended with.
         world_T_cam: (T, 4, 4) poses.
         landmarks: (N, 3) world, meters.
+        pose_covariance: (T, 6, 6) of the poses' twists, translation last; NaN where it is not known.
     """
-    warnings = []
-    change = float(np.abs(intrinsics[:2] / given_intrinsics[:2] - 1.0).max())
-    if change > _MAX_FOCAL_CHANGE:
-        warnings.append(f"the focal lengths moved by {100 * change:.0f} % from the given ones")
+    warnings = focal_warnings(given_intrinsics, intrinsics[:2])
     if not len(landmarks):
         return [*warnings, "there are no landmarks: the cameras rest on nothing that was measured"]
     first = world_T_cam[0, :3, 3]
@@ -36,4 +48,13 @@ def scene_warnings(
             f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
             "depth comes from the cue alone, and the focal length is poorly determined"
         )
+    elif pose_covariance is not None and len(world_T_cam) > 1:
+        path = float(np.linalg.norm(np.diff(world_T_cam[:, :3, 3], axis=0), axis=1).sum())
+        variance = np.einsum("nii->n", pose_covariance[1:, 3:, 3:])
+        uncertainty = float(np.sqrt(np.maximum(variance, 0.0).mean())) / path
+        if uncertainty > _MAX_UNCERTAINTY:  # false where it is not known
+            warnings.append(
+                f"camera positions are uncertain by {100 * uncertainty:.0f} % of the path's length: too little that is "
+                "static is seen well; look at masks, tracks and the share of the image that moves"
+            )
     return warnings
