@@ -14,6 +14,7 @@ from uni4d_fg.config.cues import InputConfig, LabelConfig, TrackingConfig
 from uni4d_fg.config.geometric_depth import AffineDepthConfig, GeometricDepthConfig
 from uni4d_fg.config.imu import ImuConfig
 from uni4d_fg.config.incremental import IncrementalConfig
+from uni4d_fg.config.loops import LoopsConfig
 from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.config.networks import NetworkConfig
@@ -71,6 +72,7 @@ class Config(Section):
     joint: JointConfig = setting(JointConfig(), "Cameras and moving points in one solve, after stage 3.", basic=True)
     adam: AdamConfig = setting(AdamConfig(), "The Adam solver; not used by 'lm'.")
     windows: WindowsConfig = setting(WindowsConfig(), "Reconstruction in windows.", basic=True)
+    loops: LoopsConfig = setting(LoopsConfig(), "Loop closing.")
     incremental: IncrementalConfig = setting(
         IncrementalConfig(), "Incremental solving; not used by 'reconstruct'.", basic=True
     )

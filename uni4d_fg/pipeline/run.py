@@ -38,6 +38,7 @@ from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
+from uni4d_fg.pipeline.loops import loop_closing, with_loops
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.repeats import Repeats
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
@@ -52,6 +53,7 @@ from uni4d_fg.results.labels_io import load_labels, save_labels
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.association.fragments import FragmentSearch
+from uni4d_fg.slam.loops.closing import LoopClosing
 from uni4d_fg.slam.windows.plan import Window, windows_of
 
 ValueT = TypeVar("ValueT")
@@ -232,7 +234,13 @@ def _reconstruct(
         key = stage_key(key, repeats.solved.tolist())
     key, camera = _camera(run, key, solved, solved_tracks)
     fragments = FragmentSearch.of(solved, solved_tracks, config.bundle_adjustment.rejoin)
-    key, scene, motion = _stages(run, key, *camera.apply(solved, solved_tracks, config), windows, run_stage, fragments)
+    loops = loop_closing(solved, camera, config)
+    if loops is not None:
+        # Not a source of the user's: it adds nothing to single windows, which workers may then solve.
+        run_stage = with_additions(recorder, (*sources, loops))
+    key, scene, motion = _stages(
+        run, key, *camera.apply(solved, solved_tracks, config), windows, run_stage, fragments, loops
+    )
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)
     adjusted = summary.stages["bundle_adjustment"]
@@ -274,6 +282,7 @@ def _stages(
     windows: list[Window],
     run_stage: StageRunner,
     fragments: FragmentSearch | None,
+    loops: LoopClosing | None,
 ) -> tuple[str, Arrays, Arrays]:
     """Run stages 1 to 3, as one graph or in windows, and the joint solve.
 
@@ -281,11 +290,12 @@ def _stages(
         The key so far, and the records of the static scene and of what moves: both are that of the joint solve if there
         is one.
     """
+    sources = run.sources if loops is None else (*run.sources, loops)
     if windows:
         if config.joint.enabled:
             run.summary.warnings.append(NOT_IN_WINDOWS)
         _forget(run, "joint")
-        key = stage_key(key, config.bundle_adjustment, config.windows, *fingerprints(run.sources))
+        key = stage_key(key, config.bundle_adjustment, config.windows, *fingerprints(sources))
         before = key
         if run.workers is not None and run.sources:
             run.summary.warnings.append(NOT_ON_WORKERS)
@@ -297,17 +307,22 @@ def _stages(
                 sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
                 run.reporter, run.should_stop, workers,
             )  # fmt: skip
-            scene = run.step("bundle_adjustment", key, lambda hooks: scene_step(parts, before, hooks))
+            scene = run.step(
+                "bundle_adjustment", key, lambda hooks: with_loops(loops, scene_step(parts, before, hooks))
+            )
             key = stage_key(key, config.nonrigid, *_searched(config))
             after = key
             return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
     inertial = [] if run.imu is None else [config.imu, run.imu.digest()]
-    key = stage_key(key, config.bundle_adjustment, *inertial, *fingerprints(run.sources))
+    key = stage_key(key, config.bundle_adjustment, *inertial, *fingerprints(sources))
     scene = run.step(
         "bundle_adjustment",
         key,
-        lambda hooks: bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage, run.imu, fragments),
+        lambda hooks: with_loops(
+            loops,
+            bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage, run.imu, fragments),
+        ),
     )
     key = stage_key(key, config.nonrigid, *_searched(config))
     motion = run.step(

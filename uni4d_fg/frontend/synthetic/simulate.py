@@ -13,7 +13,7 @@ from uni4d_fg.frontend.synthetic.camera_path import camera_path
 from uni4d_fg.frontend.synthetic.noise import noisy_depths, noisy_masks, noisy_tracks
 from uni4d_fg.frontend.synthetic.raycast import RayCaster
 from uni4d_fg.frontend.synthetic.render import render_frame
-from uni4d_fg.frontend.synthetic.scene import make_scene
+from uni4d_fg.frontend.synthetic.scene import Scene, make_scene
 from uni4d_fg.frontend.synthetic.tracks import ExactTracks, SurfacePoints, TrackFollower, pick_points, query_grid
 from uni4d_fg.geometry.lens import Lens
 
@@ -34,8 +34,15 @@ class Simulation:
     """(T,) each frame's depth cue times ``exp`` of this is the true depth, up to field and pixel noise."""
 
 
-def simulate(config: SyntheticSceneConfig) -> Simulation:
+def simulate(
+    config: SyntheticSceneConfig, scene: Scene | None = None, world_T_cam: FloatArray | None = None
+) -> Simulation:
     """Build the scene, render it, follow its tracks and add noise.
+
+    Args:
+        config: What to make.
+        scene: Another world than the configuration's room and objects.
+        world_T_cam: (T, 4, 4) another path than the configuration's.
 
     Raises:
         MissingDependencyError: If Open3D cannot be loaded.
@@ -46,8 +53,10 @@ def simulate(config: SyntheticSceneConfig) -> Simulation:
     )
     lens = Lens(config.camera_model, config.distortion)
     timestamps = np.arange(config.num_frames) / config.frame_rate
-    world_T_cam = camera_path(config.path, timestamps, config.camera_speed)
-    scene = make_scene(config.objects, config.objects_per_kind, config.object_scale)
+    if world_T_cam is None:
+        world_T_cam = camera_path(config.path, timestamps, config.camera_speed)
+    if scene is None:
+        scene = make_scene(config.objects, config.objects_per_kind, config.object_scale)
 
     depths = np.empty((config.num_frames, *image_size), dtype=np.float32)
     masks = np.empty((config.num_frames, *image_size), dtype=np.int32)

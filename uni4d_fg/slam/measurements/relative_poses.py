@@ -27,6 +27,8 @@ class RelativePoseSource:
     poses: RelativePoses
     kernel: KernelConfig
     fingerprint: str = ""
+    is_metric: bool = True
+    """Whether their lengths are measured in meters, rather than by the cameras and cues that they join."""
 
     def __post_init__(self) -> None:
         self.noise(np.eye(6))
@@ -59,4 +61,4 @@ class RelativePoseSource:
             )
             for i in here.tolist()
         ]  # fmt: skip
-        return Addition(factors) if factors else None
+        return Addition(factors, is_metric=self.is_metric) if factors else None
