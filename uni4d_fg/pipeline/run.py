@@ -290,7 +290,7 @@ def _stages(
         The key so far, and the records of the static scene and of what moves: both are that of the joint solve if there
         is one.
     """
-    sources = run.sources if loops is None else (*run.sources, loops)
+    sources: tuple[FactorSource, ...] = run.sources if loops is None else (*run.sources, loops)
     if windows:
         if config.joint.enabled:
             run.summary.warnings.append(NOT_IN_WINDOWS)
