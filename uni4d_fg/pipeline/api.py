@@ -18,6 +18,7 @@ from uni4d_fg.frontend.shots.cuts import find_cuts
 from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.pipeline.measurements import MeasurementFiles
 from uni4d_fg.pipeline.run import reconstruct as reconstruct_sequence
+from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
@@ -40,6 +41,7 @@ def reconstruct(
     measurements: MeasurementFiles | None = None,
     resume: bool = False,
     reporter: Reporter | None = None,
+    workers: WorkerOptions | None = None,
 ) -> Reconstruction:
     """Reconstruct a video and write the run folder; cues that it does not bring are made.
 
@@ -56,6 +58,7 @@ def reconstruct(
         measurements: Files of odometry, GPS and relative poses, see ``docs/measurements.md``.
         resume: Take over stages of the folder whose input and configuration are the same.
         reporter: Progress.
+        workers: Processes that solve the windows of a long video (``windows.frames``), see ``docs/cluster.md``.
 
     Returns:
         Cameras, static points and trajectories; depth and clouds are in the folder.
@@ -88,6 +91,6 @@ def reconstruct(
     cues = None if report is None else report.to_dict()
     reconstruct_sequence(
         sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions,
-        measurements=measurements, imu=samples, warnings=warnings,
+        measurements=measurements, imu=samples, warnings=warnings, workers=workers,
     )  # fmt: skip
     return load_reconstruction(RunFolder(folder).reconstruction)
