@@ -123,6 +123,12 @@ WindowScheduler = Annotated[
         show_default=False,
     ),
 ]  # fmt: skip
+WindowTimeLimit = Annotated[
+    float,
+    typer.Option(
+        "--time-limit", metavar="MINUTES", help="With --workers: a window that takes longer is ended and tried again."
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a run; finished stages are kept.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]

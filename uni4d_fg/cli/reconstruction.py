@@ -40,6 +40,7 @@ def reconstruct(
     overlap: options.WindowOverlap = None,
     workers: options.WindowProcesses = None,
     scheduler: options.WindowScheduler = None,
+    time_limit: options.WindowTimeLimit = 360.0,
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     start: options.Start = 0,
@@ -90,7 +91,9 @@ def reconstruct(
     chosen += [] if window is None else [f"windows.frames={window}"]
     chosen += [] if overlap is None else [f"windows.overlap={overlap}"]
     settings = load_config(config, [*(changes or ()), *chosen])
-    work = None if workers is None and scheduler is None else WorkerOptions(workers, scheduler)
+    work = None
+    if workers is not None or scheduler is not None:
+        work = WorkerOptions(workers, scheduler, time_limit=60.0 * time_limit)
     if work is not None and settings.windows.frames is None:
         raise ConfigError("--workers and --scheduler are for the windows of a long video: add --window N")
     source = SequenceInput.of(

@@ -95,6 +95,10 @@ def test_what_goes_wrong_with_a_window_is_said_and_graphs_are_those_of_the_last(
         assert batch.factor_type is log_scale_prior
         with pytest.raises(InputError, match="window 1 is gone"):
             list(each(describe_window, MadeItems([1], lambda index: (index, "gone", tmp_path))))
+    with workers(time_limit=2.0) as each:
+        hung = MadeItems([2], lambda index: (index, "hung", tmp_path))
+        assert list(each(describe_window, hung)) == [(0, 4)]  # at the second attempt
+        assert (tmp_path / "hung").exists()
     with workers(retries=0) as each, pytest.raises(SolverError, match="cannot be solved on the workers: its process"):
         list(each(describe_window, MadeItems([1], lambda index: (index, "killed", tmp_path))))
 

@@ -39,8 +39,12 @@ def square_or_die(item: tuple[int, str, Path]) -> tuple[int, int, int]:
 
 
 def describe_window(item: tuple[int, str, Path], run: StageRunner, hooks: Hooks) -> int:
-    """Return the number of a window squared, and leave graphs of as many points as its number tells."""
+    """Return the number of a window squared, and leave graphs of as many scales as its number tells."""
     number, fate, folder = item
+    if fate == "hung" and not (folder / "hung").exists():
+        (folder / "hung").touch()
+        while True:
+            time.sleep(3600)
     if fate == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
     if fate == "gone":
