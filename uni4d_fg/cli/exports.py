@@ -26,6 +26,7 @@ class FormatChoice(str, Enum):
     kitti = "kitti"
     ply = "ply"
     ply_frames = "ply-frames"
+    mesh = "mesh"
     glb = "glb"
     rrd = "rrd"
     uni4d = "uni4d"

@@ -7,6 +7,7 @@ from uni4d_fg.optional import import_open3d, import_pygltflib, import_rerun
 from uni4d_fg.results.export.colmap import write_colmap
 from uni4d_fg.results.export.glb import write_glb
 from uni4d_fg.results.export.gsplat import write_gsplat
+from uni4d_fg.results.export.mesh import write_mesh
 from uni4d_fg.results.export.model import Exporter
 from uni4d_fg.results.export.nerfstudio import write_nerfstudio
 from uni4d_fg.results.export.ply import write_ply_folder
@@ -23,6 +24,7 @@ FORMATS: dict[str, Exporter] = {
     "kitti": Exporter(write_kitti_folder, has_lens=True),
     "ply": Exporter(write_ply_folder, has_lens=True, require=import_open3d),
     "ply-frames": Exporter(write_ply_frames, needs_images=True, require=import_open3d),
+    "mesh": Exporter(write_mesh, needs_images=True, require=import_open3d),
     "glb": Exporter(write_glb, has_lens=True, require=import_pygltflib),
     "rrd": Exporter(write_rrd, needs_images=True, require=import_rerun),
     "uni4d": Exporter(write_uni4d_results, needs_images=True, require=import_open3d),
