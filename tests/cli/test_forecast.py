@@ -1,12 +1,19 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from uni4d_fg.cli.expected_time import expected_time
 from uni4d_fg.cli.forecast import Forecast, ForecastReporter, Share, expected_shares
+from uni4d_fg.cli.main import app
 from uni4d_fg.cli.progress import left, progress_reporter
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.plan import CuePlan
+from uni4d_fg.frontend.sequence.write import write_native
+from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 from uni4d_fg.progress import SilentReporter
 
 SIZE = (480, 640)
@@ -98,3 +105,18 @@ def test_lines_say_how_long_it_will_take(capsys: pytest.CaptureFixture[str]) -> 
         reporter.end("fine")
     assert left(forecast) == "about 1 min 0 s left"
     assert capsys.readouterr().err.endswith("fine, about 1 min 0 s left\n")
+
+
+def test_doctor_says_where_time_will_go(tmp_path: Path) -> None:
+    sequence = make_synthetic_sequence(SyntheticSceneConfig(num_frames=3, width=64, height=48, focal=60.0))
+    write_native(sequence, tmp_path / "clip")
+    found = expected_time(tmp_path / "clip", None)
+    tasks = [task["task"] for task in found["tasks"]]
+    assert tasks == ["tracks", "lens", "camera init", "bundle adjustment", "nonrigid", "fusion", "clouds and pictures"]
+    assert found["num_frames"] == 3
+    assert sum(task["share"] for task in found["tasks"]) == pytest.approx(1.0)
+    assert found["seconds"] == pytest.approx(sum(task["seconds"] for task in found["tasks"]))
+    answer = CliRunner().invoke(app, ["doctor", "--time", str(tmp_path / "clip")])
+    assert answer.exit_code == 0
+    assert answer.output.startswith("clip: 3 frames of 64 x 48 px, about ")
+    assert len(answer.output.splitlines()) == 1 + len(tasks)

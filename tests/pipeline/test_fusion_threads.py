@@ -1,4 +1,4 @@
-"""Fusion on several threads: the same bytes, with and without a frame whose cue is broken."""
+"""Threads of a run: fusion on several gives the same bytes, and BLAS has one all the time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 from pipeline_scenes import TINY, make_config, make_scene
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from uni4d_fg.factors.state import State
+from uni4d_fg.optim.stage import Stage
 from uni4d_fg.pipeline import fuse, reconstruct
 from uni4d_fg.results.run_folder import RunFolder
 
@@ -22,3 +25,21 @@ def test_threads_change_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         assert summary.stages["fusion"]["broken_frames"] == broken
         stored.append(RunFolder(tmp_path / str(threads)).depth.read_bytes())
     assert stored[1] == stored[0]
+
+
+def test_blas_has_one_thread_in_the_whole_run(tmp_path: Path) -> None:
+    seen: dict[str, int] = {}
+
+    def look(stage: Stage, state: State) -> None:
+        blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+        seen[stage.kind] = max(blas)
+
+    def most() -> int:
+        return max(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+
+    with threadpool_limits(3, user_api="blas"):
+        before = most()
+        reconstruct(make_scene(TINY), tmp_path / "run", make_config(), additions=[look])
+        assert most() == before
+    assert {"camera_init", "bundle_adjustment", "nonrigid"} <= set(seen)
+    assert set(seen.values()) == {1}

@@ -7,12 +7,14 @@ import platform
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from uni4d_fg.cli import options
 from uni4d_fg.cli.console import print_json
+from uni4d_fg.cli.expected_time import expected_time, expected_time_lines
 from uni4d_fg.errors import ConfigError, MissingDependencyError
 
 _PACKAGES = ("numpy", "scipy", "gtsam", "opencv-python-headless", "open3d", "matplotlib", "pydantic", "typer")
@@ -30,9 +32,23 @@ _EXTRAS = {
 
 def doctor(
     cards: Annotated[bool, typer.Option("--cards", help="Show how to get the ONNX file of every model card.")] = False,
+    time: Annotated[
+        Path | None,
+        typer.Option(
+            "--time", metavar="SEQ|VIDEO", help="Say where the time of reconstructing this video will go instead."
+        ),
+    ] = None,
+    config: options.ConfigChoice = None,
     json: options.Json = False,
 ) -> None:
     """Say what is installed, how fast it will be, which networks can be used, and what is missing."""
+    if time is not None:
+        expected = expected_time(time, config)
+        if json:
+            print_json(expected)
+        else:
+            typer.echo("\n".join(expected_time_lines(expected)))
+        return
     found = examine()
     if json:
         print_json(found)

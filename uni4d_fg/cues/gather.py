@@ -27,6 +27,7 @@ from uni4d_fg.frontend.sequence.frames import no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
+from uni4d_fg.optim.threads import on_one_blas_thread
 from uni4d_fg.progress import Reporter, SilentReporter
 
 NOT_METRIC = (
@@ -39,6 +40,7 @@ NOT_METRIC_RELATIVE = (
 )
 
 
+@on_one_blas_thread
 def gather_cues(
     video: Video,
     plan: CuePlan,

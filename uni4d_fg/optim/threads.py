@@ -6,13 +6,14 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from functools import cache
-from typing import Any, TypeVar
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
+P = ParamSpec("P")
 
 
 @cache
@@ -29,6 +30,17 @@ def limit_blas_threads(limit: int) -> AbstractContextManager[Any]:
 def one_blas_thread() -> AbstractContextManager[Any]:
     """Limit BLAS to one thread per caller while our own threads divide the work."""
     return limit_blas_threads(1)
+
+
+def on_one_blas_thread(function: Callable[P, ResultT]) -> Callable[P, ResultT]:
+    """Let a function run with BLAS limited as by :func:`one_blas_thread`."""
+
+    @wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> ResultT:
+        with one_blas_thread():
+            return function(*args, **kwargs)
+
+    return limited
 
 
 _limits: list[int] = []

@@ -29,6 +29,7 @@ from uni4d_fg.optim.problem_io import save_stage_graph
 from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.stage_graph import RecordingRunner
+from uni4d_fg.optim.threads import one_blas_thread
 from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
@@ -175,7 +176,9 @@ def reconstruct(
     """
     check_sequence(sequence)
     recorder = RecordingRunner(stage_runner(config))
-    with run_lock(run_dir):
+    # Threads of BLAS wait for each other in busy loops: on a busy machine small matrices take a thousand times as long.
+    # What is worth several threads divides its work itself.
+    with one_blas_thread(), run_lock(run_dir):
         mark_run(run_dir)
         return _reconstruct(
             recorder, sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False),

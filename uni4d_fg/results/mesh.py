@@ -2,7 +2,7 @@
 
 Every frame's depth is averaged into a truncated signed distance field, in which what stands before a surface in one
 frame and was seen through in others goes away; the surface is its zero (Curless and Levoy, "A volumetric method for
-building complex models from range images", 1996; Open3D's scalable volume).
+building complex models from range images", 1996; Open3D's grid of voxel blocks).
 """
 
 from __future__ import annotations
@@ -31,6 +31,10 @@ _TRUNCATED_AT = 5.0
 """Distances are kept up to this many voxels."""
 _FARTHEST_PERCENTILE = 98.0
 """Of depth; what is farther is left out, as its noise is larger than the volume is deep."""
+_BLOCK_VOXELS, _BLOCKS = 16, 10_000
+"""Of the volume's blocks: side, voxels, and the number that there is room for at first."""
+_LEAST_FRAMES = 3
+"""A surface was seen by this many frames."""
 _LOOKED_AT = 12
 """Frames whose depth says how large the scene is."""
 
@@ -40,8 +44,6 @@ class Volume:
     """Size of a distance field."""
 
     voxel_m: float
-    truncation_m: float
-    """How far from a surface a distance is kept."""
     farthest_m: float
     """Depth up to which frames are used."""
 
@@ -62,7 +64,7 @@ class Volume:
         usual, farthest = (float(v) for v in np.percentile(values, (50.0, _FARTHEST_PERCENTILE)))
         if voxel_m is None:
             voxel_m = max(_VOXEL_PX * usual / focal_px, farthest / _FINEST)
-        return cls(voxel_m, _TRUNCATED_AT * voxel_m, farthest)
+        return cls(voxel_m, farthest)
 
 
 def static_mesh(
@@ -92,25 +94,32 @@ def static_mesh(
         MissingDependencyError: If Open3D cannot be loaded.
     """
     open3d = import_open3d()
-    integration = open3d.pipelines.integration
-    field = integration.ScalableTSDFVolume(volume.voxel_m, volume.truncation_m, integration.TSDFVolumeColorType.RGB8)
-    height, width = result.image_size
+    core, image = open3d.core, open3d.t.geometry.Image
+    field = open3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight", "color"), (core.float32,) * 3, ((1), (1), (3)),
+        volume.voxel_m, _BLOCK_VOXELS, _BLOCKS, core.Device("CPU:0"),
+    )  # fmt: skip
     for frame, pose in enumerate(result.world_T_cam):
         depth, mask = depths[frame], sequence.masks[frame]
         with np.errstate(invalid="ignore"):
             usable = np.isfinite(depth) & (depth > 0.0) & (depth < volume.farthest_m)
         usable &= ~dilate(mask > 0, _BAND_PX) & ~depth_edges(depth, config.edge_relative_gradient)
-        seen = open3d.geometry.RGBDImage.create_from_color_and_depth(
-            open3d.geometry.Image(np.ascontiguousarray(sequence.images[frame])),
-            open3d.geometry.Image(np.where(usable, depth, np.float32(0.0))),
-            depth_scale=1.0, depth_trunc=volume.farthest_m, convert_rgb_to_intensity=False,
-        )  # fmt: skip
-        camera = open3d.camera.PinholeCameraIntrinsic(width, height, *result.frame_intrinsics[frame].tolist())
-        field.integrate(seen, camera, _inverse(pose))
+        if usable.any():
+            seen = image(core.Tensor(np.where(usable, depth, np.float32(0.0))))
+            colors = image(core.Tensor(sequence.images[frame].astype(np.float32) / np.float32(255.0)))
+            camera, pose_of_world = core.Tensor(_matrix(result.frame_intrinsics[frame])), core.Tensor(_inverse(pose))
+            limits = (1.0, volume.farthest_m, _TRUNCATED_AT)  # units per meter, m, voxels
+            blocks = field.compute_unique_block_coordinates(seen, camera, pose_of_world, *limits)
+            field.integrate(blocks, seen, colors, camera, pose_of_world, *limits)
         done(frame + 1)
-    mesh = field.extract_triangle_mesh()
+    mesh = field.extract_triangle_mesh(float(min(_LEAST_FRAMES, len(result.world_T_cam)))).to_legacy()
     mesh.compute_vertex_normals()
     return mesh
+
+
+def _matrix(intrinsics: FloatArray) -> FloatArray:
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _inverse(pose: FloatArray) -> FloatArray:

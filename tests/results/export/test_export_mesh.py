@@ -12,6 +12,7 @@ from uni4d_fg.errors import OutputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.synthetic.scene import make_scene
 from uni4d_fg.results.export.model import ExportReport
+from uni4d_fg.results.fusion.clouds import depth_edges, dilate
 from uni4d_fg.results.mesh import Volume
 from uni4d_fg.results.run import Run
 
@@ -59,9 +60,11 @@ def test_the_mesh_covers_what_frames_see(source: Run, exported: Callable[..., tu
         open3d.core.Tensor(np.linalg.inv(result.world_T_cam[3])), result.image_size[1], result.image_size[0],
     )  # fmt: skip
     met = caster.cast_rays(rays)["t_hit"].numpy()
-    still = source.need_sequence().masks[3] == 0
+    still = ~dilate(source.need_sequence().masks[3] > 0, 5)
+    still &= ~depth_edges(source.need_depth("a mesh")[3], source.config.fusion.edge_relative_gradient)
     still[:, :8] = still[:, -8:] = still[:8] = still[-8:] = False
-    assert np.isfinite(met[still]).mean() > 0.9
+    # What fewer than three of seven frames see, and what is far, is left out.
+    assert np.isfinite(met[still]).mean() > 0.75
 
 
 def camera(intrinsics: np.ndarray) -> np.ndarray:
