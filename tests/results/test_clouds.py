@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from uni4d_fg.errors import InputError, MissingDependencyError, OutputError
 from uni4d_fg.optional import import_open3d
+from uni4d_fg.results import clouds
 from uni4d_fg.results.clouds import read_ply, write_clouds, write_ply
 from uni4d_fg.results.run_folder import RunFolder
 
@@ -63,3 +66,37 @@ def test_a_folder_in_the_way_is_an_output_error(tmp_path: Path) -> None:
     (tmp_path / "a.ply").mkdir()
     with pytest.raises(OutputError, match="cannot write"):
         write_ply(tmp_path / "a.ply", *random_cloud(3, 4))
+
+
+@pytest.mark.parametrize("with_normals", [False, True])
+def test_own_files_are_read_as_open3d_reads_them(tmp_path: Path, with_normals: bool) -> None:
+    rng = np.random.default_rng(0)
+    points, colors = rng.normal(size=(500, 3)), rng.integers(0, 256, (500, 3)).astype(np.uint8)
+    write_ply(tmp_path / "a.ply", points, colors, points if with_normals else None)
+    theirs = clouds._read_any(tmp_path / "a.ply")
+    own = clouds._read_own(
+        tmp_path / "a.ply", (tmp_path / "a.ply").read_bytes()[:4096], (tmp_path / "a.ply").stat().st_size
+    )
+    assert own is not None
+    for mine, other in zip(own, theirs, strict=True):
+        np.testing.assert_array_equal(mine, other)
+        assert mine.dtype == other.dtype
+
+
+def test_files_of_others_and_cut_ones_are_not_taken_for_own(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, np.ones((4, 3)), np.ones((4, 3), np.uint8))
+    data = path.read_bytes()
+    assert clouds._read_own(path, data, len(data) - 1) is None
+    other = data.replace(b"property float z", b"property double z")
+    assert clouds._read_own(path, other, len(other)) is None
+    assert clouds._read_own(path, b"", 0) is None
+
+
+def test_the_viewer_starts_without_open3d_and_matplotlib() -> None:
+    code = (
+        "import sys, uni4d_fg.cli.main, uni4d_fg.results.view.viewer, uni4d_fg.results.view.server; "
+        "print([name for name in ('open3d', 'matplotlib', 'torch', 'gtsam') if name in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"

@@ -16,6 +16,12 @@ from uni4d_fg.reading import check_regular
 from uni4d_fg.results.run_folder import RunFolder
 
 _MAX_PLY_HEADER = 4096
+_OWN_HEADER = re.compile(
+    rb"ply\nformat binary_little_endian 1\.0\n(comment [^\n]*\n)*element vertex (?P<count>\d{1,12})\n"
+    rb"property float x\nproperty float y\nproperty float z\n"
+    rb"(?P<normals>property float nx\nproperty float ny\nproperty float nz\n)?"
+    rb"property uchar red\nproperty uchar green\nproperty uchar blue\n"
+)
 _AXES, _NORMAL, _CHANNELS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 
 
@@ -58,9 +64,33 @@ def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
     """
     size = check_regular(path, "a PLY file")
     with open(path, "rb") as stream:
-        announced = re.search(rb"\nelement vertex (\d{1,20})\r?\n", stream.read(_MAX_PLY_HEADER))
+        head = stream.read(_MAX_PLY_HEADER)
+    announced = re.search(rb"\nelement vertex (\d{1,20})\r?\n", head)
     if announced is not None and int(announced[1]) > size:
         raise InputError(f"{path}: announces {int(announced[1])} points in {size} bytes; make the clouds again")
+    found = _read_own(path, head, size) or _read_any(path)
+    if not np.isfinite(found[0]).all():
+        raise InputError(f"{path}: has points or colors that are NaN or infinite; make the clouds again")
+    return found
+
+
+def _read_own(path: Path, head: bytes, size: int) -> tuple[FloatArray, ImageArray] | None:
+    """Read a file as :func:`write_ply` leaves it; None if it is any other. Loading Open3D takes longer than this."""
+    text, ended, _ = head.partition(b"end_header\n")
+    found = re.fullmatch(_OWN_HEADER, text)
+    if not ended or found is None:
+        return None
+    names = ("x", "y", "z", *(("nx", "ny", "nz") if found["normals"] else ()))
+    record = np.dtype([*((name, "<f4") for name in names), ("rgb", "u1", 3)])
+    start, count = len(text) + len(ended), int(found["count"])
+    if size != start + count * record.itemsize:
+        return None
+    rows = np.fromfile(path, record, count, offset=start)
+    return np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64), np.ascontiguousarray(rows["rgb"])
+
+
+def _read_any(path: Path) -> tuple[FloatArray, ImageArray]:
+    """Read a PLY of any program by Open3D; white where it has no colors. Raises InputError."""
     open3d = import_open3d()
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.io.read_point_cloud(str(path))
@@ -68,7 +98,7 @@ def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
     colors = np.asarray(cloud.colors, dtype=np.float64).reshape(-1, 3)
     if colors.shape != points.shape:
         colors = np.ones_like(points)
-    if not (np.isfinite(points).all() and np.isfinite(colors).all()):
+    if not np.isfinite(colors).all():
         raise InputError(f"{path}: has points or colors that are NaN or infinite; make the clouds again")
     return points, np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 

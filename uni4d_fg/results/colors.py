@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
@@ -40,6 +39,9 @@ def value_range(values: FloatArray) -> tuple[float, float]:
 
 def value_colors(values: FloatArray, bounds: tuple[float, float]) -> ImageArray:
     """Return a color per value, (..., 3) RGB: dark violet at the lower bound, yellow at the upper; gray for NaN."""
+    # Here, because loading it takes a while, and what has no values needs no colors.
+    import matplotlib
+
     low, high = bounds
     values = np.asarray(values, dtype=np.float64)
     known = ~np.isnan(values)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 INK = "#22262b"
 MUTED = "#8a9099"
@@ -23,6 +24,10 @@ _COMPRESS_LEVEL = 3
 
 def new_figure(width_in: float, height_in: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     """Return an empty white figure, size in inches, that draws without a display; no layout for axes placed by hand."""
+    # Loading matplotlib takes a while, and who only asks for frames or axes needs none of it.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width_in, height_in), dpi=120, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
