@@ -269,8 +269,9 @@ def test_a_phone_shows_the_scene_first_and_the_panel_when_asked() -> None:
         page.goto(f"http://127.0.0.1:{port}")
         control = page.get_by_text("Frames per second")
         control.wait_for(state="attached")
-        # Long enough for the panel to have opened, if nothing had closed it.
-        time.sleep(2.0)
+        # Closing takes some pictures; nothing opens it again.
+        control.wait_for(state="hidden")
+        time.sleep(1.0)
         assert not control.is_visible()
         handle = page.locator('div[style*="cursor: pointer"]').first
         box = handle.bounding_box()
