@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from uni4d_fg.counted import counted
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.pipeline.benchmark.pictures import draw_runtime, draw_video
@@ -99,7 +100,7 @@ def draw_pictures(folder: Path, root: Path, dataset: str, methods: list[Method],
 def _page(facts: Facts, tables: list[Table], methods: list[Method], pictures: list[Path]) -> str:
     tried = max((len(m.results) for m in methods), default=0)
     lines = [f"# {facts.title}, split `{facts.split}`", "", f"    {facts.command}", ""]
-    lines += [f"{tried} videos; {facts.convention}.", ""]
+    lines += [f"{counted(tried, 'video')}; {facts.convention}.", ""]
     lines += [", ".join(f"{name} {value}" for name, value in facts.machine.items()), ""]
     failures = [(m.name, v, r.failed) for m in methods for v, r in m.results.items() if r.failed is not None]
     if failures:

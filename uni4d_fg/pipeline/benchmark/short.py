@@ -15,6 +15,9 @@ _CHOSEN = (
 )
 """Beginning of a table's name, and which of its columns are shown under which name."""
 
+_USUAL = "depth-uni4d-scale"
+"""One scale per video; the first protocol where this one was not asked for."""
+
 
 def short_table(title: str, tables: list[Table]) -> Table | None:
     """Return the chosen columns of the first table of every kind; None if there is nothing to show.
@@ -27,9 +30,10 @@ def short_table(title: str, tables: list[Table]) -> Table | None:
     rows: dict[str, Row] = {}
     notes = []
     for start, names in _CHOSEN:
-        table = next((t for t in tables if t.name.startswith(start) and not t.name.endswith("-videos")), None)
-        if table is None:
+        fitting = [t for t in tables if t.name.startswith(start) and not t.name.endswith("-videos")]
+        if not fitting:
             continue
+        table = next((t for t in fitting if t.name == _USUAL), fitting[0])
         if start in ("poses-", "depth-"):
             notes.append(f"{'poses' if start == 'poses-' else 'depth'}: `{table.name.removeprefix(start)}`")
         here = [column for column in table.columns if column.name in names]
