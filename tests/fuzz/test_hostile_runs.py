@@ -61,6 +61,18 @@ def test_damaged_runs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory
     judged_verb(*(words := data.draw(st.sampled_from(VERBS)))[:1], run, *words[1:])
 
 
+RIVAL = {"first": 0, "second": 4, "focal": 70.0, "unexplained": 0.3, "degrees": 9.0, "degrees_per_frame": 2.0}
+START = {
+    "focal_px": 75.0,
+    "focal_interval_px": [60.0, 95.0],
+    "focal_is_open": [True, False],
+    "stretch_along_view": [0.8, 1.3],
+    "unexplained": 0.25,
+    "registered": 1.0,
+    "starts": [RIVAL, {**RIVAL, "first": 1}],
+}
+
+
 @hostile
 @given(data=st.data())
 def test_summaries_and_inputs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
@@ -74,6 +86,8 @@ def test_summaries_and_inputs(run_folder: Path, tmp_path_factory: pytest.TempPat
         (run / "labels.npz").unlink()
     for name in ("summary.json", "input.json"):
         whole = json.loads((run_folder / name).read_text())
+        if name == "summary.json":  # with what runs from video alone record too
+            whole["cues"]["start"] = START
         (run / name).write_text(json.dumps(data.draw(changed_json(whole))))
     judged(stored_input, run)
     if isinstance(judged(read_summary, run / "summary.json"), dict):
@@ -99,12 +113,62 @@ def test_summaries_and_inputs(run_folder: Path, tmp_path_factory: pytest.TempPat
         {"versions": [1]},
         {"stages": {"x": {"peak_memory_mb": 1e400}}},
         {"stages": {"x": {"dropped": {"a": "b"}}}},
+        {"cues": {"seconds": "long"}},
+        {"cues": {"start": [1]}},
+        {"cues": {"start": {"focal_px": 0.0}}},
+        {"cues": {"start": {"focal_interval_px": [60.0]}}},
+        {"cues": {"start": {"focal_interval_px": ["a", "b"]}}},
+        {"cues": {"start": {"stretch_along_view": ["a", "b"]}}},
+        {"cues": {"start": {"starts": [5]}}},
+        {"cues": {"start": {"starts": {"degrees": 5}}}},
+        {"cues": {"start": {"starts": [{"degrees": "many"}]}}},
     ],
 )
 def test_a_summary_of_other_types_is_refused(run_folder: Path, tmp_path: Path, change: dict[str, Any]) -> None:
     whole = json.loads((run_folder / "summary.json").read_text())
     (tmp_path / "summary.json").write_text(json.dumps({**whole, **change}))
     assert "run the reconstruction again" in str(judged(read_summary, tmp_path / "summary.json"))
+
+
+SOLVE = {"name": "a", "initial_energy": 2.0, "final_energy": 1.0, "energy_curve": [[1, 1.0]], "num_factors": 3}
+NOTHING_KNOWN = {name: None for name in ("focal_px", "unexplained")} | {
+    "focal_interval_px": [None, None],
+    "stretch_along_view": [None, None],
+    "starts": [{"first": 1, "second": 2, "degrees": None, "degrees_per_frame": None, "unexplained": None}],
+}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stages": {"x": {"solves": [{**SOLVE, "energy_curve": [[0, 1.7e308], [1, 1e308]]}]}}},
+        {"stages": {"x": {"solves": [{**SOLVE, "initial_energy": 5e-324, "energy_curve": [[1, 5e-324]]}]}}},
+        {"stages": {"x": {"solves": [{**SOLVE, "energy_curve": [[-1.7e308, 1.0], [1.7e308, 1.0]]}]}}},
+        {"stages": {"x": {"solves": [{**SOLVE, "energy_curve": [[1e200, 1.0], [1e200, 1.0]]}]}}},
+        {"stages": {"x": {"solves": [{**SOLVE, "initial_energy": None}]}}},
+        {"stages": {"x": {"solves": [{"energy_curve": [[1, 1.0]]}]}}},
+        {"stages": {"x": {"solves": [{**SOLVE, "initial_energy": None, "final_energy": None}] * 9}}},
+        {"stages": {"x": {"solves": [{}] * 9}}},
+        {"stages": {"x": {"solves": [{**SOLVE, "num_factors": 2**53, "final_energy": -1.7e308}] * 9}}},
+        {"stages": {"x": {"seconds": 1.7e308}, "y": {"seconds": 1.7e308, "peak_memory_mb": -1e308}}},
+        {"cues": {"seconds": 1.7e308, "start": START}},
+        {"cues": {"start": NOTHING_KNOWN}},
+        {"cues": {"start": {**START, "focal_px": 5e-324, "unexplained": -1e308}}},
+        {"cues": {"start": {}}},
+    ],
+)
+def test_a_summary_of_odd_numbers_still_makes_a_page(
+    run_folder: Path, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    from uni4d_fg.results.report.build import report_page
+    from uni4d_fg.results.run import Run
+
+    shutil.copy(run_folder / "reconstruction.npz", tmp_path)
+    whole = json.loads((run_folder / "summary.json").read_text())
+    (tmp_path / "summary.json").write_text(json.dumps({**whole, **change}))
+    page = judged(lambda: report_page(Run(tmp_path)))
+    assert isinstance(page, str)
+    assert "What was run" in page
 
 
 def test_a_whole_summary_reads_back_as_it_was_written(run_folder: Path) -> None:

@@ -14,6 +14,7 @@ _MAX_BYTES = 256 * 1024**2
 
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class _Part(BaseModel):
@@ -56,11 +57,32 @@ class _Stage(_Part):
     tracks: dict[str, Count] = {}
 
 
+class _Rival(_Part):
+    first: Count = 0
+    second: Count = 0
+    degrees: Number | None = None
+    degrees_per_frame: Number | None = None
+    unexplained: Number | None = None
+
+
+class _Start(_Part):
+    """What motion alone left open; numbers that were not finite are null."""
+
+    focal_px: Positive | None = None
+    focal_interval_px: Annotated[list[Positive | None], Field(min_length=2, max_length=2)] = [None, None]
+    focal_is_open: Annotated[list[bool], Field(min_length=2, max_length=2)] = [False, False]
+    stretch_along_view: Annotated[list[Number | None], Field(min_length=2, max_length=2)] = [None, None]
+    unexplained: Number | None = None
+    starts: list[_Rival] = []
+
+
 class _Cues(_Part):
     sources: dict[str, str] = {}
     facts: list[str] = []
     warnings: list[str] = []
     metric: bool = True
+    seconds: Number = 0.0
+    start: _Start = _Start()
 
 
 class _Sequence(_Part):

@@ -28,7 +28,7 @@ def test_ticks_are_round_and_within_the_range(low: float, length: float, whole: 
         assert len(ticks) >= 2
 
 
-@given(st.lists(st.floats(allow_nan=True, allow_infinity=True, width=32), min_size=1, max_size=40), st.booleans())
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=40), st.booleans())
 def test_any_values_give_a_well_formed_chart_inside_its_frame(values: list[float], log: bool) -> None:
     chart = line_chart("c", "A <chart>", [Line("a & b", range(len(values)), values)], x_label="x", y_label="y", log=log)
     root = ElementTree.fromstring(chart)

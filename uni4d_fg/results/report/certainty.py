@@ -41,10 +41,9 @@ def _scale(run: Run) -> Iterator[str]:
 def _start(run: Run) -> Iterator[str]:
     """Say what motion alone left open, where cameras were found from it."""
     start = _recorded_start(run)
-    interval, focal = start.get("focal_interval_px"), start.get("focal_px")
-    if isinstance(focal, int | float) and isinstance(interval, list) and len(interval) == 2:
-        low, high = (float(value) for value in interval)
-        is_open = [*start.get("focal_is_open", []), False, False][:2]
+    (low, high), focal = start.get("focal_interval_px", (None, None)), start.get("focal_px")
+    if focal is not None and low is not None and high is not None:
+        is_open = start.get("focal_is_open", (False, False))
         reach = max(focal - low, high - focal) / focal
         if any(is_open) or reach > _OPEN:
             below = "any shorter focal length" if is_open[0] else f"{low:.0f} px"
@@ -59,7 +58,7 @@ def _start(run: Run) -> Iterator[str]:
                 "tracks fit worse."
             )
     unexplained = start.get("unexplained")
-    if isinstance(unexplained, int | float):
+    if unexplained is not None:
         verdict = "that is little: much may move, or tracks are bad" if unexplained > _MUCH_UNEXPLAINED else "as usual"
         yield (
             f"The first cameras explain {100 * (1 - unexplained):.0f} % of the tracks that were held out to judge them "
@@ -67,30 +66,27 @@ def _start(run: Run) -> Iterator[str]:
         )
     starts = start.get("starts", [])
     if starts:
-        worst = max(starts, key=lambda rival: rival.get("degrees", 0.0))
-        if worst.get("degrees", 0.0) > _TURNED_DEG:
+        turned = max(rival.get("degrees") or 0.0 for rival in starts)
+        if turned > _TURNED_DEG:
             yield (
                 "The cameras are ambiguous: another start of the search explains the tracks nearly as well, with "
-                f"cameras that are turned by {worst['degrees']:.0f} degrees."
+                f"cameras that are turned by {turned:.0f} degrees."
             )
         else:
             yield (
                 f"{counted(len(starts), 'other start')} of the search that explained the tracks nearly as well gave "
-                f"the same cameras, within {worst.get('degrees', 0.0):.1f} degrees."
+                f"the same cameras, within {turned:.1f} degrees."
             )
 
 
 def _recorded_start(run: Run) -> dict[str, Any]:
-    cues = run.summary.get("cues")
-    start = cues.get("start") if isinstance(cues, dict) else None
-    return start if isinstance(start, dict) else {}
+    start: dict[str, Any] = run.summary.get("cues", {}).get("start", {})
+    return start
 
 
 def _stretch(start: dict[str, Any]) -> str:
-    stretch = start.get("stretch_along_view")
-    if not isinstance(stretch, list) or len(stretch) != 2:
-        return ""
-    return f", by {100 * (stretch[0] - 1):+.0f} to {100 * (stretch[1] - 1):+.0f} %"
+    low, high = start.get("stretch_along_view", (None, None))
+    return "" if low is None or high is None else f", by {100 * (low - 1):+.0f} to {100 * (high - 1):+.0f} %"
 
 
 def _cameras(run: Run) -> Iterator[str]:
@@ -128,9 +124,10 @@ def _starts_table(run: Run) -> list[Markup]:
     rows = [
         [
             f"{rival.get('first')} and {rival.get('second')}", number(rival.get("degrees"), 3),
-            number(rival.get("degrees_per_frame"), 3), f"{100 * (1 - rival.get('unexplained', 1.0)):.0f} %",
+            number(rival.get("degrees_per_frame"), 3), "–" if left is None else f"{100 * (1 - left):.0f} %",
         ]
         for rival in starts
+        for left in [rival.get("unexplained")]
     ]  # fmt: skip
     head = ("frames it started from", "turned by, deg", "per frame, deg", "explains")
     caption = "Other starts of the search for cameras"

@@ -14,11 +14,14 @@ _WIDTH, _HEIGHT = 440, 230
 _LEFT, _RIGHT, _TOP, _BOTTOM = 70, 12, 14, 42
 _DASHES = (None, "6 3", "2 3", "8 3 2 3", "1 4", "10 4")
 _MAX_POINTS = 400
+_LOG_MARGIN = math.log10(1.1)
+_LARGEST, _SMALLEST = 1e300, 1e-300
+"""Values beyond are left out: the axes' arithmetic would leave the range of numbers."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One curve; y may hold NaN, where it is broken."""
+    """One curve; y may hold NaN, where it is broken, as it is at numbers that cannot be drawn."""
 
     name: str
     x: Sequence[float]
@@ -46,7 +49,7 @@ def line_chart(
         return element("p", f"{title}: nothing to draw.", class_="muted")
     x_low, x_high = _widen(float(xs.min()), float(xs.max()))
     if log:
-        y_low, y_high = _widen(*(math.log10(v) for v in (ys.min() / 1.1, ys.max() * 1.1)))
+        y_low, y_high = _widen(math.log10(ys.min()) - _LOG_MARGIN, math.log10(ys.max()) + _LOG_MARGIN)
         ticks = [(math.log10(value), value) for value in _log_ticks(10**y_low, 10**y_high)]
     else:
         y_low, y_high = _widen(1.05 * min(0.0, float(ys.min())), 1.05 * max(0.0, float(ys.max())))
@@ -107,7 +110,9 @@ def legend(names: Sequence[str]) -> Markup:
 
 
 def nice_ticks(low: float, high: float, *, count: int = 5, whole: bool = False) -> list[float]:
-    """Return about ``count`` round numbers within a range; whole ones if asked for."""
+    """Return about ``count`` round numbers within a range; whole ones if asked for; none where digits do not reach."""
+    if not 1e-12 * max(abs(low), abs(high)) < high - low < math.inf:
+        return []
     step = 10.0 ** math.floor(math.log10((high - low) / count))
     for factor in (1, 2, 5, 10):
         if (high - low) / (factor * step) <= count:
@@ -132,12 +137,18 @@ def _clean(line: Line, log: bool) -> tuple[np.ndarray, np.ndarray]:
     x, y = np.asarray(line.x, dtype=np.float64), np.array(line.y, dtype=np.float64)
     step = max(1, -(-len(x) // _MAX_POINTS))
     x, y = x[::step], y[::step]
-    y[~np.isfinite(y) | (log & (y <= 0.0))] = np.nan
+    shown = np.abs(x) < _LARGEST  # False for NaN
+    x, y = x[shown], y[shown]
+    y[~(np.abs(y) < _LARGEST) | (log & (y < _SMALLEST))] = np.nan
     return x, y
 
 
 def _widen(low: float, high: float) -> tuple[float, float]:
-    return (low, high) if high > low else (low - 0.5, low + 0.5)
+    """Return a range with room for ticks, also where all values are alike up to their last digits."""
+    room = max(abs(low), abs(high)) * 1e-6
+    if high - low > room:
+        return low, high
+    return low - max(0.5, room), high + max(0.5, room)
 
 
 def _path(points: list[tuple[float, float]]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from uni4d_fg.results.report.chart import Line, line_chart
@@ -28,12 +29,13 @@ def energies(run: Run) -> Markup:
 def _solves(stage: str, solves: list[dict[str, Any]]) -> Markup:
     out: list[Markup] = [_terms(solve) for solve in solves]
     curves = []
-    names = [str(solve["name"]).replace("_", " ") for solve in solves]
+    names = [str(solve.get("name", "")).replace("_", " ") for solve in solves]
     for index, solve in enumerate(solves):
         curve = solve.get("energy_curve") or []
         if not curve:
             continue
-        start = [] if "rounds" in solve.get("notes", {}) else [[0, solve["initial_energy"]]]
+        initial = solve.get("initial_energy")
+        start = [] if initial is None or "rounds" in solve.get("notes", {}) else [[0, initial]]
         points = [*start, *curve]
         name = names[index]
         if names.count(name) > 1:
@@ -69,7 +71,9 @@ def _windows(stage: str, solves: list[dict[str, Any]]) -> Markup:
     x = list(range(1, len(solves) + 1))
 
     def per_factor(field: str) -> list[float]:
-        return [float(solve.get(field, 0.0)) / max(int(solve.get("num_factors", 0)), 1) for solve in solves]
+        energies = [solve.get(field) for solve in solves]
+        factors = [max(int(solve.get("num_factors", 0)), 1) for solve in solves]
+        return [math.nan if e is None else float(e) / n for e, n in zip(energies, factors, strict=True)]
 
     chart = line_chart(
         f"energy-{stage}", f"Energy per factor at the start and at the end of {len(solves)} windows",

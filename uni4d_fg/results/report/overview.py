@@ -56,7 +56,7 @@ def _facts(run: Run) -> Markup:
 def _time_taken(stages: float, cues: Any) -> str:
     """Return the whole time: that of the cues is the larger part where a video brings none."""
     making = cues.get("seconds", 0.0) if isinstance(cues, dict) else 0.0
-    if not isinstance(making, int | float) or not making > 0:
+    if not making > 0:
         return f"{stages:.1f} s"
     return f"{stages + making:.1f} s, {making:.1f} s of it for cues"
 
