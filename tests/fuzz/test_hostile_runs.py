@@ -157,9 +157,7 @@ NOTHING_KNOWN = {name: None for name in ("focal_px", "unexplained")} | {
         {"cues": {"start": {}}},
     ],
 )
-def test_a_summary_of_odd_numbers_still_makes_a_page(
-    run_folder: Path, tmp_path: Path, change: dict[str, Any]
-) -> None:
+def test_a_summary_of_odd_numbers_still_makes_a_page(run_folder: Path, tmp_path: Path, change: dict[str, Any]) -> None:
     from uni4d_fg.results.report.build import report_page
     from uni4d_fg.results.run import Run
 

@@ -63,6 +63,41 @@ def test_one_that_hangs_again_and_again_is_given_up_and_says_where_it_was(client
     assert "square_or_die" in (tmp_path / "0.hang.txt").read_text()
 
 
+@pytest.mark.slow
+def test_when_every_worker_is_gone_the_wait_ends_with_one_error(tmp_path: Path) -> None:
+    options = WorkerOptions(workers=1, workerless_limit=2.0)
+    with open_workers(options, 1, tmp_path) as client:
+        found = spread(client, square_or_die, [(0, "", tmp_path), (1, "always hung", tmp_path)], options, [
+            tmp_path / "0.hang.txt", tmp_path / "1.hang.txt",
+        ])  # fmt: skip
+        index, value = next(found)
+        assert (index, value[0]) == (0, 0)
+        client.cluster.scale(0)
+        with pytest.raises(
+            InputError, match=r"no worker has been there for 2 s, while 1 task must still be done.*kept"
+        ):
+            next(found)
+
+
+def test_without_workers_or_scheduler_there_is_one_error(tmp_path: Path) -> None:
+    def lost() -> dict[str, int]:
+        raise OSError("in <Client>:\n closed")
+
+    for there, said in (
+        (dict, "no worker has been there for 0.1 s"),
+        (lost, r"no longer answers \(in <Client>: closed"),
+    ):
+        client = SimpleNamespace(nthreads=there, cancel=lambda futures, force: None)
+        with pytest.raises(InputError, match=said):
+            list(
+                spread(
+                    client, square_or_die, [(0, "", tmp_path)], WorkerOptions(workerless_limit=0.1), [tmp_path / "t"]
+                )
+            )
+    with pytest.raises(ConfigError, match="without workers"):
+        WorkerOptions(workerless_limit=0.0)
+
+
 def test_a_stop_abandons_what_is_not_finished(client: Any, tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
         list(spread(client, square_or_die, [(0, "", tmp_path)], WorkerOptions(), [tmp_path / "t"], lambda: True))

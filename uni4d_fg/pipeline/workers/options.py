@@ -25,6 +25,8 @@ class WorkerOptions:
     """A task that takes longer is ended, s; needs processes of their own."""
     retries: int = 2
     """How often a task is tried again whose process died or was ended."""
+    workerless_limit: float = 300.0
+    """With no worker left for so long, s, the wait for another ends."""
 
     def __post_init__(self) -> None:
         for name, value, least in (
@@ -34,5 +36,7 @@ class WorkerOptions:
                 raise ConfigError(f"--{name} {value}: must be at least {least}")
         if self.time_limit is not None and not self.time_limit > 0:
             raise ConfigError(f"time limit of {self.time_limit:g} s: must be above 0")
+        if not self.workerless_limit > 0:
+            raise ConfigError(f"limit of {self.workerless_limit:g} s without workers: must be above 0")
         if self.scheduler is not None and self.workers is not None:
             raise ConfigError("--workers starts processes here, --scheduler uses those of a cluster: give one of them")

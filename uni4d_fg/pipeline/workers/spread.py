@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -9,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.counted import counted
+from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.optional import import_distributed
 from uni4d_fg.pipeline.workers.guarded import guarded
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -55,16 +57,26 @@ def spread(
 
     Raises:
         Cancelled: If ``should_stop`` turned true; what is not finished is abandoned.
+        InputError: If no worker has been there for ``options.workerless_limit``, or the scheduler does not answer.
     """
     distributed = import_distributed()
     waiting = deque(range(len(items)))
     attempts, unstarted = [0] * len(items), [0] * len(items)
     flying: dict[Any, tuple[int, str]] = {}
+    last_seen = time.monotonic()
     try:
         while waiting or flying:
             if should_stop is not None and should_stop():
                 raise Cancelled("stopped; finished tasks are kept")
-            present = set(client.nthreads())
+            present = _present(client)
+            if present:
+                last_seen = time.monotonic()
+            elif time.monotonic() - last_seen > options.workerless_limit:
+                raise InputError(
+                    f"no worker has been there for {options.workerless_limit:g} s, while "
+                    f"{counted(len(waiting) + len(flying), 'task')} must still be done: see why the workers ended "
+                    "(memory?), start others, and run the same command again; finished tasks are kept"
+                )
             idle = sorted(present - {address for _, address in flying.values()})
             for address in idle[: len(waiting)]:
                 index = waiting.popleft()
@@ -95,7 +107,19 @@ def spread(
                     else:
                         yield index, Lost(_obituary(traces[index], attempts[index], options))
     finally:
-        client.cancel(list(flying), force=True)
+        with contextlib.suppress(OSError, TimeoutError):  # the scheduler may be gone, and its tasks with it
+            client.cancel(list(flying), force=True)
+
+
+def _present(client: Any) -> set[str]:
+    """Return the addresses of the workers that are there."""
+    try:
+        return set(client.nthreads())
+    except (OSError, TimeoutError) as error:
+        raise InputError(
+            f"the Dask scheduler no longer answers ({' '.join(str(error).split())}); start it again, and run the same "
+            "command again: finished tasks are kept"
+        ) from error
 
 
 def _finished(flying: dict[Any, tuple[int, str]], distributed: Any) -> list[Any]:
