@@ -32,7 +32,7 @@ MAX_RATIO, FREE_BYTES = 200, 256 * 1024**2
 _CRC_MAGIC = b"\nU4DCRC1"
 """Begins what follows the data of a .npy file with checksums: a count and CRC-32 numbers of equal parts of the data."""
 
-_BROKEN_ARCHIVE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, OSError, RuntimeError)
+DAMAGED_ARCHIVE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, OSError, RuntimeError)
 
 _BROKEN_HEADER = (ValueError, SyntaxError, TypeError, LookupError, AttributeError, RecursionError, tokenize.TokenError)
 """What numpy raises on the header of a damaged array: it parses it as Python, and again as Python 2's."""
@@ -318,7 +318,7 @@ def load_npz(
         raise
     except MemoryError as error:
         raise InputError(f"{path}: its arrays do not fit into memory") from error
-    except _BROKEN_ARCHIVE as error:
+    except DAMAGED_ARCHIVE as error:
         if isinstance(error, PermissionError):
             raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
         raise InputError(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import hypothesis
 import numpy as np
 import pytest
 from hostile import TINY_SCENE
+
+# Small samples of the formats that are read, which other tests write.
+sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("frontend/datasets", "pipeline/benchmark")]
 
 EFFORT = float(os.environ.get("UNI4D_FG_FUZZ", "1"))
 hypothesis.settings.register_profile(

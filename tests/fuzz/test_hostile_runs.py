@@ -72,6 +72,15 @@ START = {
     "starts": [RIVAL, {**RIVAL, "first": 1}],
 }
 
+CUES = {
+    "sources": {"depth": "from camera motion"},
+    "facts": ["a fact"],
+    "warnings": ["a warning"],
+    "metric": False,
+    "seconds": 3.5,
+    "start": START,
+}
+
 
 @hostile
 @given(data=st.data())
@@ -87,7 +96,7 @@ def test_summaries_and_inputs(run_folder: Path, tmp_path_factory: pytest.TempPat
     for name in ("summary.json", "input.json"):
         whole = json.loads((run_folder / name).read_text())
         if name == "summary.json":  # with what runs from video alone record too
-            whole["cues"]["start"] = START
+            whole["cues"] = CUES
         (run / name).write_text(json.dumps(data.draw(changed_json(whole))))
     judged(stored_input, run)
     if isinstance(judged(read_summary, run / "summary.json"), dict):

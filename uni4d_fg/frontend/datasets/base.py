@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
 
@@ -137,12 +138,13 @@ def images_of(folder: Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> tuple[P
 
 def numbers_without_gap(paths: tuple[Path, ...]) -> None:
     """Raise InputError if a frame is missing between the first and the last."""
-    numbers = [frame_number(path) for path in paths]
-    absent = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
-    if absent:
-        raise SequenceProblem(
-            paths[0].parent, f"lacks frame(s) {some_of(absent)} between others", "unpack the archive again"
-        )
+    numbers = sorted(frame_number(path) for path in paths)
+    for before, after in pairwise(numbers):
+        if after > before + 1:
+            absent = f"{before + 1}" if after == before + 2 else f"{before + 1} to {after - 1}"
+            raise SequenceProblem(
+                paths[0].parent, f"lacks frame(s) {absent} between others", "unpack the archive again"
+            )
 
 
 def images_of_truth(paths: tuple[Path, ...], truth: Path, suffix: str) -> None:
@@ -162,7 +164,8 @@ def make_video(name: str, root: Path, paths: tuple[Path, ...], timestamps: Float
     """
     if len(paths) < MIN_FRAMES:
         raise SequenceProblem(root, f"has {len(paths)} frame(s) to use", f"give at least {MIN_FRAMES}")
-    stuck = np.flatnonzero(np.diff(timestamps) <= 0)
+    with np.errstate(invalid="ignore"):  # of infinite times
+        stuck = np.flatnonzero(~(np.diff(timestamps) > 0) | ~np.isfinite(timestamps[1:]))
     if stuck.size:
         raise SequenceProblem(root, f"times do not increase after frame {stuck[0]}", "unpack the archive again")
     images = ImageFolder(paths)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from uni4d_fg.arrays import Int32Array
 from uni4d_fg.frontend.datasets.base import (
@@ -94,6 +94,7 @@ class PaletteMasks(FileFrames[Int32Array]):
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             if isinstance(error, SequenceProblem):
                 raise
-            raise SequenceProblem(path, f"cannot be decoded as an image ({error})", _AGAIN) from error
+            what = "of no known kind" if isinstance(error, UnidentifiedImageError) else str(error)
+            raise SequenceProblem(path, f"cannot be decoded as an image ({what})", _AGAIN) from error
         # The masks of 2016 are black and white.
         return (labels > 0).astype(np.int32) if labels.max(initial=0) == 255 else labels.astype(np.int32)

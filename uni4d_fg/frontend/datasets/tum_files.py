@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.reading import read_text
 
@@ -21,6 +22,7 @@ MAX_DIFFERENCE_S = 0.02
 """Farthest apart that two measurements belong together, as in the benchmark's ``associate.py``."""
 CALIBRATION = "calibration.txt"
 _AGAIN = "unpack the archive again"
+_MAX_PAIRS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,19 @@ def associate(
 
     Returns:
         (index of first, index of second), by the former. What ``associate.py`` of the benchmark finds.
+
+    Raises:
+        InputError: If far more times are near each other than those of a camera can be.
     """
     pairs: list[tuple[float, int, int]] = []
     order = np.argsort(second, kind="stable")
     low = np.searchsorted(second[order], first - max_difference_s, side="left")
     high = np.searchsorted(second[order], first + max_difference_s, side="right")
+    if int((high - low).sum()) > _MAX_PAIRS:
+        raise InputError(
+            f"the lists have {len(first)} and {len(second)} times, most of them closer than {max_difference_s:g} s to "
+            "many others; no camera is that fast: check rgb.txt, depth.txt and groundtruth.txt"
+        )
     for i in range(len(first)):
         for j in order[low[i] : high[i]]:
             distance = abs(float(first[i]) - float(second[j]))

@@ -13,6 +13,7 @@ grid:
 from __future__ import annotations
 
 import itertools
+import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,6 +39,8 @@ PAPER: dict[str, dict[str, Any]] = {
     "depth from motion": {"depth": "motion"},
 }
 """The rows of ``uni4d-fg ablate`` without a file: the paper's ablations as far as no other network is needed."""
+
+_MOST_ROWS = 500
 
 
 class _Way(BaseModel):
@@ -78,8 +81,11 @@ def read_grid(path: Path) -> list[Configuration]:
         found = _File.model_validate(parse_yaml(read_text(path)) or {})
     except (ConfigError, ValidationError) as error:
         raise ConfigError(f"{path}: is not a list of configurations ({_said(error)})") from error
-    if not found.rows and not found.grid:
+    count = len(found.rows) + (math.prod(map(len, found.grid.values())) if found.grid else 0)
+    if not count:
         raise ConfigError(f"{path}: has neither rows nor a grid; name at least one configuration")
+    if count > _MOST_ROWS:
+        raise ConfigError(f"{path}: makes {count} configurations, at most {_MOST_ROWS} are run; split it")
     named = [(name, row or {}) for name, row in found.rows.items()]
     for values in itertools.product(*found.grid.values()):
         if values:
@@ -100,14 +106,17 @@ def configurations(named: list[tuple[str, dict[str, Any]]], base: dict[str, Any]
     """
     made = []
     for name, row in named:
-        both = {**base, **row, "set": (*base.get("set", ()), *row.get("set", ()))}
         try:
-            chosen = _Way.model_validate(both).named(_folder_name(name))
-        except ValidationError as error:
-            raise ConfigError(f"{where}: {name}: {_said(error)}") from error
-        load_config(chosen.preset, chosen.changes)
+            changes = (*_Way.model_validate(base).set, *_Way.model_validate(row).set)
+            chosen = _Way.model_validate({**base, **row, "set": changes}).named(_folder_name(name))
+            load_config(chosen.preset, chosen.changes)
+        except (ConfigError, ValidationError) as error:
+            raise ConfigError(f"{where}: {name[:60]}: {_said(error)}") from error
         made.append(chosen)
-    check_names(made)
+    try:
+        check_names(made)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
     return made
 
 

@@ -60,7 +60,11 @@ def read_published(path: Path = FILE) -> list[Published]:
     try:
         tables = TypeAdapter(list[_PrintedTable]).validate_python(parse_yaml(read_text(path)))
     except (ConfigError, ValidationError) as error:
-        raise ConfigError(f"{path}: is not a list of printed tables ({error})") from error
+        what = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False, include_input=False)[0]
+            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise ConfigError(f"{path}: is not a list of printed tables ({what})") from error
     rows = []
     for table in tables:
         for method, values in table.rows.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -17,6 +18,8 @@ from uni4d_fg.reading import read_json
 Masks: TypeAlias = Literal["cue", "true", "motion", "none"]
 """Of the cues, of the truth, from motion, or none at all: everything is static."""
 
+_LONGEST_NAME = 200
+"""Bytes."""
 RESULT_VERSION = 2
 """Part of every key; raised whenever scores come out otherwise."""
 
@@ -109,9 +112,11 @@ def stored_result(task: Task) -> TaskResult | None:
 
 def check_names(configurations: list[Configuration]) -> None:
     """Raise ConfigError if two configurations have one name, or one that is no name of a folder."""
-    names = [c.name for c in configurations]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(c.name for c in configurations).items():
+        if count > 1:
             raise ConfigError(f"two configurations are named {name!r}; give each a name of its own")
-        if not name or name != Path(name).name or name.startswith("."):
-            raise ConfigError(f"{name!r} cannot be the name of a folder; choose another name for the configuration")
+        is_plain = name.isprintable() and len(name.encode("utf-8", "replace")) <= _LONGEST_NAME
+        if not name or not is_plain or name != Path(name).name or name.startswith("."):
+            raise ConfigError(
+                f"{name[:60]!r} cannot be the name of a folder; choose another name for the configuration"
+            )

@@ -33,7 +33,7 @@ def read_exr(data: bytes, where: str) -> Float32Array:
     """
     try:
         return _decode(data, where)
-    except (struct.error, ValueError, IndexError, KeyError, zlib.error) as error:
+    except (struct.error, ValueError, LookupError, OverflowError, zlib.error) as error:
         raise InputError(f"{where}: cannot be decoded as EXR ({error}); write it again, or as .npy") from error
 
 
@@ -51,6 +51,8 @@ def _decode(data: bytes, where: str) -> Float32Array:
     if compression not in _LINES:
         raise InputError(f"{where}: has compression {compression}; write it without or with zip, or as .npy")
     channels = _channels(header["channels"])
+    if not channels:
+        raise ValueError("it has no channel")
     wanted = next((name for name in ("Z", "Y", "R") if name in channels), next(iter(channels)))
     lines = _LINES[compression]
     out: Float32Array = np.full((height, width), np.nan, dtype=np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zipfile
 from pathlib import Path
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import load_npy, load_npz
+from uni4d_fg.files import DAMAGED_ARCHIVE, load_npy, load_npz
 from uni4d_fg.frontend.sequence.decode import MAX_PIXELS, clean_depth, read_depth
 from uni4d_fg.frontend.sequence.frames import LazyFrames
 from uni4d_fg.frontend.sequence.layout import is_visible_file
@@ -21,6 +22,7 @@ from uni4d_fg.reading import MAX_IMAGE_BYTES, list_folder, read_bytes, read_text
 DEPTH_SUFFIXES = (".npy", ".npz", ".exr", ".png", ".raw")
 _RAW_HEADER = struct.Struct("<iiiQ")
 _CV_32F = 5
+_FRAME = re.compile("[0-9]{1,9}")
 
 
 class MethodDepth(LazyFrames[Float32Array]):
@@ -55,9 +57,9 @@ class ZippedDepth(LazyFrames[Float32Array]):
         try:
             with zipfile.ZipFile(path) as archive:
                 members = {Path(n).stem: n for n in archive.namelist() if n.endswith(".exr")}
-        except (OSError, zipfile.BadZipFile) as error:
+        except DAMAGED_ARCHIVE as error:
             raise InputError(f"{path}: cannot be read as a zip of EXR files ({error}); write it again") from error
-        self.members = {int(stem): name for stem, name in members.items() if stem.isdigit()}
+        self.members = {int(stem): name for stem, name in members.items() if _FRAME.fullmatch(stem)}
         absent = sorted(set(range(num_frames)) - set(self.members))
         if absent:
             raise InputError(f"{path}: lacks depth of frame {absent[0]}; run the program on all frames")
@@ -70,11 +72,15 @@ class ZippedDepth(LazyFrames[Float32Array]):
         return f"{self.path}: {self.members[frame]}"
 
     def _read(self, frame: int) -> Float32Array:
-        with zipfile.ZipFile(self.path) as archive:
-            info = archive.getinfo(self.members[frame])
-            if info.file_size > MAX_IMAGE_BYTES:
-                raise InputError(f"{self.where(frame)}: would take {info.file_size} bytes; check the file")
-            return read_exr(archive.read(info), self.where(frame))
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                info = archive.getinfo(self.members[frame])
+                if info.file_size > MAX_IMAGE_BYTES:
+                    raise InputError(f"{self.where(frame)}: would take {info.file_size} bytes; check the file")
+                data = archive.read(info)
+        except DAMAGED_ARCHIVE as error:
+            raise InputError(f"{self.where(frame)}: cannot be unpacked ({error}); write it again") from error
+        return read_exr(data, self.where(frame))
 
 
 def depth_files(folder: Path, pattern: str, count: int) -> tuple[Path, ...]:
@@ -144,7 +150,10 @@ def read_numbers(path: Path, columns: tuple[int, ...]) -> FloatArray:
             raise InputError(f"{path}, line {number}: {len(words)} columns, expected {' or '.join(map(str, columns))}")
     if not rows:
         raise InputError(f"{path}: holds no numbers; check the output of the method")
-    return np.array(rows)
+    values = np.array(rows)
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: has a number that is NaN or infinite; check the output of the method")
+    return values
 
 
 def poses_of_rows(path: Path, rows: FloatArray, times: FloatArray, *, scalar_first: bool) -> FloatArray:
