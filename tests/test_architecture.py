@@ -129,3 +129,36 @@ def test_names_of_test_modules_are_unique() -> None:
         if path.name != "conftest.py":
             seen[path.name].append(str(path.relative_to(CHECKOUT)))
     assert {name: paths for name, paths in seen.items() if len(paths) > 1} == {}
+
+
+READERS = {
+    "reading", "files", "frontend.sequence.containers", "frontend.sequence.decode", "frontend.sequence.display",
+    "results.clouds", "results.export.frames", "cues.session", "cli.comparison", "cli.docs", "config.docs",
+    "factors.tables", "pipeline.compare.machine", "pipeline.compare.memory", "pipeline.workers.memory",
+    "results.view.page",
+}  # fmt: skip
+"""Modules that open files themselves: after a look at them, or files of the package, of the system or their own."""
+
+
+def reads_a_file(call: ast.Call) -> bool:
+    """Tell whether a call opens a file for reading without :mod:`uni4d_fg.reading`."""
+    words = [arg.value for arg in call.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)]
+    if isinstance(call.func, ast.Name):  # read_text and read_bytes are those of uni4d_fg.reading then
+        return call.func.id == "open" and not any(set(word) & set("wax+") for word in words)
+    if not isinstance(call.func, ast.Attribute):
+        return False
+    if call.func.attr == "open":
+        named = {keyword.arg for keyword in call.keywords}
+        return bool(named & {"encoding", "newline"} or set(words) & {"r", "rb"}) and not set(words) & {"w", "wb", "a"}
+    return call.func.attr in ("read_text", "read_bytes", "loadtxt", "genfromtxt", "fromfile")
+
+
+def test_files_of_others_are_read_by_way_of_one_module() -> None:
+    """A pipe or a device in place of a file would hang what opens it without a look."""
+    found = {
+        module.removeprefix("uni4d_fg.")
+        for module, path in FILES.items()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and reads_a_file(node)
+    }
+    assert found == READERS

@@ -67,13 +67,13 @@ def test_strict_tum_parser_names_the_line(tmp_path: Path, line: str, message: st
 
 
 def test_missing_and_empty_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"absent\.tum: cannot be read"):
+    with pytest.raises(InputError, match=r"absent\.tum: no such file"):
         read_tum(tmp_path / "absent.tum")
     (tmp_path / "empty.tum").write_text("# nothing\n\n")
     with pytest.raises(InputError, match="holds no pose"):
         read_tum(tmp_path / "empty.tum")
     (tmp_path / "binary.tum").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is not text in UTF-8"):
         read_tum(tmp_path / "binary.tum")
 
 

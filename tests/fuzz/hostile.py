@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
 import signal
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hypothesis import strategies as st
 
 from uni4d_fg.cli import main
@@ -195,3 +198,38 @@ def damaged(draw: st.DrawFn, data: bytes) -> bytes:
         else:
             changed[place : place + 4] = b"\xff\xff\xff\x7f"
     return bytes(changed)
+
+
+@st.composite
+def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
+    """An array of other values, another type or another shape."""
+    kind = draw(st.sampled_from(["value", "all", "type", "cut", "flat", "empty", "more"]))
+    value = draw(st.sampled_from([np.nan, np.inf, -1.0, 0.0, 1e300, 1e-300, 2.0**40]))
+    with np.errstate(all="ignore"):
+        if kind == "value" and array.size:
+            array = array.copy()
+            array.reshape(-1)[draw(st.integers(0, array.size - 1))] = np.asarray(value).astype(array.dtype)
+        elif kind == "all":
+            array = np.full_like(array, np.asarray(value).astype(array.dtype))
+        elif kind == "type":
+            array = array.astype(draw(st.sampled_from(["i8", "f2", "u1", "c16", "?", "U3"])))
+        elif kind == "cut" and array.ndim:
+            array = array[:-1]
+        elif kind == "flat":
+            array = array.reshape(-1)
+        elif kind == "more":
+            array = array[None]
+        else:
+            array = array[:0] if array.ndim else np.zeros((0,), array.dtype)
+    return array
+
+
+def special_files(folder: Path) -> list[Path]:
+    """What is there in place of a file, none of which may be opened as one."""
+    pipe, loop, nowhere, plug = (folder / name for name in ("pipe", "loop", "nowhere", "plug"))
+    os.mkfifo(pipe)
+    loop.symlink_to(loop)
+    nowhere.symlink_to(folder / "absent")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(plug))
+    return [pipe, loop, nowhere, plug, Path("/dev/zero"), Path("/dev/null"), folder]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import test_benchmark_methods as methods
 import yaml
-from hostile import changed_json, damaged, judged, judged_verb, state_of
+from hostile import changed_array, changed_json, damaged, judged, judged_verb, state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -139,30 +139,6 @@ def test_outputs_of_other_programs(tmp_path_factory: pytest.TempPathFactory, dat
         else:
             path.write_bytes(data.draw(damaged(path.read_bytes())))
     judged(read_method, f"{layout}:theirs={folder}", OneVideo(), folder, ("v",), ("sim3",), ("metric", "uni4d-scale"))
-
-
-@st.composite
-def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
-    """An array of other values, another type or another shape."""
-    kind = draw(st.sampled_from(["value", "all", "type", "cut", "flat", "empty", "more"]))
-    value = draw(st.sampled_from([np.nan, np.inf, -1.0, 0.0, 1e300, 1e-300, 2.0**40]))
-    with np.errstate(all="ignore"):
-        if kind == "value" and array.size:
-            array = array.copy()
-            array.reshape(-1)[draw(st.integers(0, array.size - 1))] = np.asarray(value).astype(array.dtype)
-        elif kind == "all":
-            array = np.full_like(array, np.asarray(value).astype(array.dtype))
-        elif kind == "type":
-            array = array.astype(draw(st.sampled_from(["i8", "f2", "u1", "c16", "?", "U3"])))
-        elif kind == "cut" and array.ndim:
-            array = array[:-1]
-        elif kind == "flat":
-            array = array.reshape(-1)
-        elif kind == "more":
-            array = array[None]
-        else:
-            array = array[:0] if array.ndim else np.zeros((0,), array.dtype)
-    return array
 
 
 @hostile

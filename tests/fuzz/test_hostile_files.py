@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import socket
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,15 +12,21 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from hostile import JSON, changed_json, damaged, judged, judged_verb
+from hostile import JSON, changed_json, damaged, judged, judged_verb, special_files
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.cues.card import card_names, cards_folder, load_card
 from uni4d_fg.cues.mask_files import open_mask_files, read_ids
 from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.files import load_npy, load_npz, save_npz
+from uni4d_fg.frontend.measurements.gps import read_gps
+from uni4d_fg.frontend.measurements.imu import read_imu
+from uni4d_fg.frontend.measurements.odometry import read_odometry
+from uni4d_fg.frontend.measurements.relative_poses import read_relative_poses
+from uni4d_fg.frontend.sequence.calibration_files import Calibration, load_calibration
 from uni4d_fg.frontend.sequence.decode import read_depth, read_image, read_mask
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.sequence.validate import validate_sequence
@@ -302,17 +306,6 @@ def test_a_cloud_that_announces_too_much(run_folder: Path, tmp_path: Path) -> No
     assert "announces 99999999999 points" in str(judged(read_ply, tmp_path / "a.ply"))
 
 
-def special_files(folder: Path) -> list[Path]:
-    """What is there in place of a file, none of which may be opened as one."""
-    pipe, loop, nowhere, plug = (folder / name for name in ("pipe", "loop", "nowhere", "plug"))
-    os.mkfifo(pipe)
-    loop.symlink_to(loop)
-    nowhere.symlink_to(folder / "absent")
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(plug))
-    return [pipe, loop, nowhere, plug, Path("/dev/zero"), Path("/dev/null"), folder]
-
-
 ITEMS = [
     "rgb",
     "K.npy",
@@ -353,13 +346,98 @@ def test_a_dangling_calibration_is_not_an_absent_one(sequence_folder: Path, tmp_
 
 
 @pytest.mark.parametrize(
-    "options", [["--masks"], ["--depth"], ["--tracks"], ["--intrinsics"], ["--config"], ["--depth-model"]]
-)
+    "options",
+    [
+        ["--masks"], ["--depth"], ["--tracks"], ["--intrinsics"], ["--config"], ["--depth-model"], ["--odometry"],
+        ["--gps"], ["--relative-poses"], ["--imu"], ["--track-model"],
+    ],
+)  # fmt: skip
 def test_pipes_devices_and_links_as_options(sequence_folder: Path, tmp_path: Path, options: list[str]) -> None:
     for special in special_files(tmp_path)[:-1]:
         words = ["reconstruct", sequence_folder, *options, special, "--out", tmp_path / "run"]
         assert judged_verb(*words)[0] in (2, 3), special
         assert not (tmp_path / "run").exists()
+
+
+CALIBRATIONS: dict[str, Any] = {
+    ".json": {"fl_x": 75.0, "fl_y": 75.0, "cx": 40.0, "cy": 30.0, "w": 80, "h": 60, "k1": 0.1, "p1": 0.0},
+    ".yaml": {
+        "image_width": 80, "image_height": 60, "distortion_model": "plumb_bob",
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [75.0, 0, 39.5, 0, 75.0, 29.5, 0, 0, 1]},
+        "distortion_coefficients": {"rows": 1, "cols": 4, "data": [0.1, 0.0, 0.0, 0.0]},
+    },
+    ".yml": {
+        "cam0": {
+            "camera_model": "pinhole", "distortion_model": "radtan", "resolution": [80, 60],
+            "intrinsics": [75.0, 75.0, 39.5, 29.5], "distortion_coeffs": [0.1, 0.0, 0.0, 0.0],
+        }
+    },
+}  # fmt: skip
+COLMAP = "1 OPENCV 80 60 75 75 40 30 0.1 0 0 0"
+NUMBERS = st.sampled_from(["nan", "inf", "1e400", "-1", "0", "1e300", "1e-300", "9" * 400, "9" * 5000, "x", ""])
+
+
+@st.composite
+def changed_words(draw: st.DrawFn, text: str) -> str:
+    """A text with one to three of its words replaced by numbers that are none, or too large."""
+    words = text.replace(",", " , ").split(" ")
+    for _ in range(draw(st.integers(1, 3))):
+        words[draw(st.integers(0, len(words) - 1))] = draw(NUMBERS)
+    return " ".join(words).replace(" , ", ",")
+
+
+@hostile
+@given(data=st.data())
+def test_calibrations(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    suffix = data.draw(st.sampled_from([".txt", *CALIBRATIONS]))
+    path = tmp_path_factory.getbasetemp() / f"calibration{suffix}"
+    if suffix == ".txt":
+        text = data.draw(changed_words(COLMAP))
+    else:
+        value = data.draw(changed_json(CALIBRATIONS[suffix]))
+        text = json.dumps(value) if suffix == ".json" else yaml.safe_dump(value)
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    found = judged(load_calibration, path, 6, (60, 80))
+    if isinstance(found, Calibration):
+        assert np.isfinite(found.intrinsics).all()
+        assert np.isfinite(found.lens.padded).all()
+
+
+UNIT = "0.1 0.2 0.3 0 0 0 1"
+MEASURED: dict[str, str] = {
+    "odometry.tum": "".join(f"{t} {UNIT}\n" for t in range(6)),
+    "gps.csv": "timestamp,x,y,z,sigma\n" + "".join(f"{t},0.1,{t},0.3,0.5\n" for t in range(6)),
+    "world.csv": "timestamp,latitude,longitude,altitude\n"
+    + "".join(f"{t},48.1,{11 + 1e-5 * t},500\n" for t in range(6)),
+    "edges.g2o": "".join(
+        f"EDGE_SE3:QUAT {t} {t + 1} {UNIT} {' '.join(['1 0 0 0 0 0', '1 0 0 0 0', '1 0 0 0', '1 0 0', '1 0', '1'])}\n"
+        for t in range(5)
+    ),
+    "imu.csv": "".join(f"{t}000000000,0.1,0.2,0.3,0,0,9.81\n" for t in range(6)),
+    "imu.yaml": "noise: euroc\ntime_offset: 0.0\nbody_T_cam: [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]\n",
+}
+
+
+@hostile
+@given(data=st.data())
+def test_measurements(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    name = data.draw(st.sampled_from(sorted(MEASURED)))
+    folder = tmp_path_factory.getbasetemp() / "measured"
+    folder.mkdir(exist_ok=True)
+    for other, text in MEASURED.items():
+        (folder / other).write_text(text)
+    text = MEASURED[name]
+    data_bytes = data.draw(st.one_of(changed_words(text).map(str.encode), damaged(text.encode())))
+    (folder / name).write_bytes(data_bytes)
+    times, config = np.arange(6.0), MeasurementsConfig()
+    if name.endswith("tum"):
+        judged(read_odometry, folder / name, times, config)
+    elif name.endswith("g2o"):
+        judged(read_relative_poses, folder / name, 6)
+    elif name.startswith("imu"):
+        judged(read_imu, folder)
+    else:
+        judged(read_gps, folder / name, times, config)
 
 
 @hostile

@@ -82,7 +82,7 @@ def reconstruct(
     from uni4d_fg.cues.intermediate import drop_intermediate
     from uni4d_fg.frontend.measurements.imu import read_imu
     from uni4d_fg.pipeline.inertial import check_goes_with_imu
-    from uni4d_fg.pipeline.measurements import MeasurementFiles
+    from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
     from uni4d_fg.pipeline.workers.options import WorkerOptions
     from uni4d_fg.slam.windows.plan import windows_of
 
@@ -111,6 +111,8 @@ def reconstruct(
     plan.check()
     files = MeasurementFiles(odometry, gps, relative_poses)
     is_measured = any(given is not None for given in (imu, odometry, gps, relative_poses))
+    # What is wrong with a file is said before anything is made.
+    read_measurements(files, opened.video.timestamps, settings.measurements)
 
     def solve(video: Video, folder: Path, again: bool, warnings: tuple[str, ...] = ()) -> tuple[RunSummary, Sequence]:
         forecast = Forecast(

@@ -2,26 +2,51 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from uni4d_fg.cues.cache import FloatMaps
 from uni4d_fg.cues.plan import CuePlan, CueReport
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import atomic_write_json, load_npy, save_npy
-from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.files import atomic_write_json, save_npy
+from uni4d_fg.frontend.sequence.assemble import as_sequence, check_count
 from uni4d_fg.frontend.sequence.frames import FileFrames, MaskFolder, no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.frontend.sequence.poses import load_poses
 from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
+from uni4d_fg.reading import check_regular, read_json
 
 MANIFEST = "cues.json"
 _FORMAT = 1
 _POSES = "initial_world_T_cam"
+_MAX_BYTES = 256 * 1024**2
+
+
+class _Report(BaseModel):
+    sources: dict[str, str] = {}
+    facts: list[str] = []
+    warnings: list[str] = []
+    metric: bool = True
+    start: dict[str, Any] = {}
+
+
+class _Manifest(BaseModel):
+    """What :func:`save_manifest` writes, as far as it is read; names are relative to the folder."""
+
+    num_frames: int
+    image_size: tuple[int, int]
+    depth: list[str] | None
+    masks: list[str] | None
+    static: bool
+    tracks: str | None
+    intrinsics: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+    initial_world_T_cam: str | None
+    report: _Report
 
 
 def save_manifest(
@@ -71,28 +96,35 @@ def load_cues(video: Video, folder: Path) -> tuple[Sequence, CueReport]:
     """
     path = folder / MANIFEST
     try:
-        stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        fits = stored["num_frames"] == video.num_frames and tuple(stored["image_size"]) == video.image_size
-        made = {name: stored[name] for name in ("depth", "masks", "tracks", "static", "intrinsics", "report", _POSES)}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); make the cues again with --resume") from error
-    if not fits:
+        stored = _Manifest.model_validate(read_json(path, _MAX_BYTES))
+    except (ValidationError, RecursionError) as error:
+        what = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False)[0]
+            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise InputError(f"{path}: does not say what the cues are ({what}); make them again with --resume") from error
+    if stored.num_frames != video.num_frames or stored.image_size != video.image_size:
         raise InputError(
-            f"{path}: cues of {stored['num_frames']} frames of {stored['image_size']} px, but {video.name} has "
+            f"{path}: cues of {stored.num_frames} frames of {list(stored.image_size)} px, but {video.name} has "
             f"{video.num_frames} of {list(video.image_size)}; was the video replaced? Make the cues again"
         )
-    changes: dict[str, Any] = {"intrinsics": np.array(made["intrinsics"], np.float64)}
-    if made["depth"] is not None:
-        changes["depths"] = FloatMaps(_paths(made["depth"], folder), video.image_size)
-    if made["masks"] is not None:
-        changes["masks"] = MaskFolder(_paths(made["masks"], folder), video.image_size)
-    elif made["static"]:
+    changes: dict[str, Any] = {"intrinsics": np.array(stored.intrinsics)}
+    if stored.depth is not None:
+        changes["depths"] = FloatMaps(_paths(stored.depth, folder, video), video.image_size)
+    if stored.masks is not None:
+        changes["masks"] = MaskFolder(_paths(stored.masks, folder, video), video.image_size)
+    elif stored.static:
         changes["masks"] = no_masks(video.image_size, video.num_frames)
-    if made["tracks"] is not None:
-        changes["tracks"] = load_tracks(folder / made["tracks"])
-    if made[_POSES] is not None:
-        changes[_POSES] = load_npy(folder / made[_POSES]).astype(np.float64)
-    return as_sequence(replace(video, **changes)), CueReport.from_dict(made["report"])
+    if stored.tracks is not None:
+        tracks = load_tracks(folder / stored.tracks)
+        check_count(folder / stored.tracks, tracks.num_frames, video.num_frames)
+        changes["tracks"] = tracks
+    if stored.initial_world_T_cam is not None:
+        changes[_POSES] = load_poses(folder / stored.initial_world_T_cam, video.num_frames)
+    report = CueReport(
+        stored.report.sources, stored.report.facts, stored.report.warnings, stored.report.metric, stored.report.start
+    )
+    return as_sequence(replace(video, **changes)), report
 
 
 def _poses(sequence: Sequence, video: Video, folder: Path) -> str | None:
@@ -113,9 +145,12 @@ def _relative(path: Path, folder: Path) -> str:
     return os.path.relpath(path, folder)
 
 
-def _paths(names: list[str], folder: Path) -> tuple[Path, ...]:
+def _paths(names: list[str], folder: Path, video: Video) -> tuple[Path, ...]:
+    check_count(folder / MANIFEST, len(names), video.num_frames)
     paths = tuple(folder / name for name in names)
-    missing = next((path for path in paths if not path.is_file()), None)
-    if missing is not None:
-        raise InputError(f"{missing}: a cue of this run is no longer there; make it again with --resume")
+    for path in paths:
+        try:
+            check_regular(path)
+        except InputError as error:
+            raise InputError(f"{error}; a cue of this run is no longer there: make it again with --resume") from error
     return paths

@@ -183,17 +183,6 @@ class CueReport:
             "start": dict(self.start),
         }
 
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> CueReport:
-        """Return what :meth:`to_dict` wrote."""
-        return cls(
-            dict(data.get("sources", {})),
-            list(data.get("facts", [])),
-            list(data.get("warnings", [])),
-            bool(data.get("metric", True)),
-            dict(data.get("start", {})),
-        )
-
 
 def _check_exists(path: Path) -> None:
     if not is_present(path):

@@ -14,6 +14,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_path
 from uni4d_fg.geometry.trajectory import Trajectory
+from uni4d_fg.reading import read_text
 
 TUM_FORMAT = "timestamp tx ty tz qx qy qz qw"
 KITTI_FORMAT = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
@@ -125,10 +126,7 @@ def write_kitti(path: Path, world_T_cam: FloatArray) -> None:
 
 def _read_rows(path: Path, counts: tuple[int, ...], expected: str) -> tuple[FloatArray, list[int]]:
     """Return the numbers of a text file, the same count in every line, and each row's line number."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a trajectory ({error}); expected {expected}") from error
+    text = read_text(path, what=f"a trajectory of {expected}")
     rows: list[list[float]] = []
     lines: list[int] = []
     for number, line in enumerate(text.splitlines(), start=1):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.measurements import MeasurementsConfig
-from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.measurements.gps import read_gps
 from uni4d_fg.frontend.measurements.odometry import read_odometry
 from uni4d_fg.frontend.measurements.relative_poses import read_relative_poses
 from uni4d_fg.optim.added_factors import FactorSource
+from uni4d_fg.reading import MAX_TEXT_BYTES, read_bytes
 from uni4d_fg.slam.measurements.gps import GpsSource
 from uni4d_fg.slam.measurements.odometry import OdometrySource
 from uni4d_fg.slam.measurements.relative_poses import RelativePoseSource
@@ -90,10 +90,7 @@ def _fingerprint(kind: str, path: Path, config: MeasurementsConfig) -> str:
     Raises:
         InputError: If the file cannot be read.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
+    content = read_bytes(path, MAX_TEXT_BYTES, "a file of measurements")
     digest = hashlib.blake2b(f"{kind} {config.model_dump_json()}".encode(), digest_size=16)
     digest.update(content)
     return digest.hexdigest()

@@ -56,17 +56,27 @@ def save_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
     Raises:
         OutputError: If it is not a valid reconstruction (it could not be read back) or cannot be written.
     """
-    arrays = {name: np.asarray(getattr(reconstruction, name)) for name in _LAYOUT}
-    known = {name: getattr(reconstruction, name) for name in _OPTIONAL if not name.startswith("lens_")}
-    if not reconstruction.lens.is_pinhole:
-        known["lens_model"] = [list(PARAMETERS).index(reconstruction.lens.model)]
-        known["lens_parameters"] = reconstruction.lens.padded
-    arrays |= {name: np.asarray(array) for name, array in known.items() if array is not None}
+    arrays = _arrays(reconstruction)
     problem = _problem(arrays)
     if problem:
         raise OutputError(f"{path}: not written, the reconstruction is not valid: {problem}")
     typed = {name: array.astype((_LAYOUT | _OPTIONAL)[name][0]) for name, array in arrays.items()}
     save_npz(path, format_version=np.int64(FORMAT_VERSION), **typed)
+
+
+def reconstruction_problem(reconstruction: Reconstruction) -> str | None:
+    """Return why a reconstruction is not one that a file may hold, or None."""
+    return _problem(_arrays(reconstruction))
+
+
+def _arrays(reconstruction: Reconstruction) -> dict[str, npt.NDArray[Any]]:
+    """Return what a file holds of a reconstruction."""
+    arrays = {name: np.asarray(getattr(reconstruction, name)) for name in _LAYOUT}
+    known = {name: getattr(reconstruction, name) for name in _OPTIONAL if not name.startswith("lens_")}
+    if not reconstruction.lens.is_pinhole:
+        known["lens_model"] = [list(PARAMETERS).index(reconstruction.lens.model)]
+        known["lens_parameters"] = reconstruction.lens.padded
+    return arrays | {name: np.asarray(array) for name, array in known.items() if array is not None}
 
 
 def load_reconstruction(path: Path) -> Reconstruction:
@@ -111,6 +121,10 @@ def _problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
                 return f"{name} has shape {actual}, expected {expected}{known}"
         if dtype.startswith(("int", "uint")) and arrays[name].dtype.kind not in "iu":
             return f"{name} has dtype {arrays[name].dtype}, expected {dtype}"
+        if dtype.startswith(("int", "uint")) and not _fits(arrays[name], np.iinfo(dtype)):
+            return f"{name} has a number that does not fit {dtype}"
+        if dtype == "float64" and arrays[name].dtype.kind not in "fiu":
+            return f"{name} has dtype {arrays[name].dtype}, expected numbers"
         if dtype == "bool" and arrays[name].dtype.kind != "b":
             return f"{name} has dtype {arrays[name].dtype}, expected bool"
         if name not in _MAY_BE_NAN and not np.isfinite(arrays[name]).all():
@@ -125,6 +139,8 @@ def _value_problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
     rigid = _is_rigid(poses)
     if not rigid.all():
         return f"pose {int(np.argmin(rigid))} is not a rigid transform"
+    if any((arrays[name] < 0).any() for name in ("landmark_track", "dynamic_track")):
+        return "a track has a negative number"
     if (np.diff(arrays["timestamps"]) <= 0.0).any():
         return "timestamps do not increase"
     if (arrays["intrinsics"][:2] <= 0.0).any() or (arrays["image_size"] <= 0).any():
@@ -165,6 +181,10 @@ def _object_problem(arrays: dict[str, npt.NDArray[Any]]) -> str | None:
     if not inside.all() or not has_pose[np.arange(len(poses)), reference].all():
         return "object_reference names a frame without a pose of the object"
     return None
+
+
+def _fits(array: npt.NDArray[Any], limits: np.iinfo[Any]) -> bool:
+    return not array.size or (int(array.min()) >= limits.min and int(array.max()) <= limits.max)
 
 
 def _is_rigid(poses: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:

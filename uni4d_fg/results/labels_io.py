@@ -42,12 +42,21 @@ def load_labels(path: Path) -> LabelledTracks:
     """
     arrays = load_npz(path, _RANKS, {"confidence": 2})
     confidence = arrays.get("confidence")
-    tracks = Tracks(
-        arrays["uv"].astype(np.float32),
-        arrays["visible"],
-        arrays["query_frame"].astype(np.int32),
-        None if confidence is None else confidence.astype(np.float32),
-    )
+    for name in ("query_frame", "label", "instance"):
+        whole = arrays[name].dtype.kind in "iu" and np.array_equal(arrays[name], arrays[name].astype(np.int32))
+        if not whole:
+            raise InputError(f"{path}: {name} is not of whole numbers of 32 bits")
+    if not (np.isfinite(arrays["weight"]).all() and (arrays["weight"] >= 0).all()):
+        raise InputError(f"{path}: weights must be finite and not negative")
+    try:
+        tracks = Tracks(
+            arrays["uv"].astype(np.float32),
+            arrays["visible"],
+            arrays["query_frame"].astype(np.int32),
+            None if confidence is None else confidence.astype(np.float32),
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     shape = tracks.visible.shape
     for name, expected in (("label", shape[:1]), ("instance", shape[:1]), ("weight", shape), ("depth", shape)):
         if arrays[name].shape != expected:

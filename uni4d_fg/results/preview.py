@@ -12,6 +12,7 @@ from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npz
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.results.io import reconstruction_problem
 from uni4d_fg.results.labels_io import load_labels
 from uni4d_fg.results.track_colors import track_colors
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -48,7 +49,29 @@ def preview(root: Path, labels: Path, sequence: Sequence | Video) -> tuple[Recon
         raise InputError(
             f"{root}: the run is not finished, and a video with repeated frames has no preview; wait for its end"
         )
-    return _reconstruction(found, load_labels(labels), sequence), newest
+    labelled = load_labels(labels)
+    _check_tracks(root, found, labelled, sequence.num_frames)
+    result = _reconstruction(found, labelled, sequence)
+    problem = reconstruction_problem(result)
+    if problem:
+        raise InputError(
+            f"{root}: stage {newest} of the unfinished run is damaged ({problem}); continue it with --resume"
+        )
+    return result, newest
+
+
+def _check_tracks(root: Path, found: dict[str, npt.NDArray[Any]], labelled: LabelledTracks, num_frames: int) -> None:
+    """Raise InputError unless the stages' points are of the labelled tracks, and these of the sequence."""
+    whole = labelled.tracks.num_frames == num_frames
+    for name in ("landmark_track", "track", "instance"):
+        numbers = found.get(name, np.zeros(0, np.int32))
+        limit = labelled.tracks.num_tracks if name != "instance" else np.iinfo(np.int32).max
+        inside = numbers.dtype.kind in "iu" and (not numbers.size or 0 <= numbers.min() <= numbers.max() < limit)
+        whole = whole and bool(inside)
+    if not whole:
+        raise InputError(
+            f"{root}: the unfinished run's stages do not fit its tracks (labels.npz); continue it with --resume"
+        )
 
 
 def _reconstruction(

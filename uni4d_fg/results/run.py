@@ -22,6 +22,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.reading import is_present
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.labels_io import load_labels
@@ -80,7 +81,7 @@ class Run:
         self._read_sequence = read_sequence
         if not root.is_dir():
             raise InputError(f"{root}: no such folder; give the folder of a run")
-        if not (folder.reconstruction.is_file() and folder.summary.is_file()):
+        if not (is_present(folder.reconstruction) and is_present(folder.summary)):
             if unfinished and read_sequence is not None and (root / "stages").is_dir():
                 self._open_unfinished(read_sequence)
                 return

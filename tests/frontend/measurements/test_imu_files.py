@@ -89,7 +89,7 @@ def test_a_bad_file_is_refused_by_name(tmp_path: Path, csv: str, yaml: str | Non
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"imu\.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"imu\.csv: no such file"):
         read_imu(tmp_path)
 
 

@@ -210,5 +210,5 @@ def test_a_file_without_edges_says_what_is_expected(tmp_path: Path) -> None:
     (tmp_path / "empty.g2o").write_text("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n")
     with pytest.raises(InputError, match="has no EDGE_SE3:QUAT; expected lines of EDGE_SE3:QUAT i j"):
         read_relative_poses(tmp_path / "empty.g2o", 5)
-    with pytest.raises(InputError, match="cannot be read as g2o"):
+    with pytest.raises(InputError, match="no such file; a g2o file with lines of EDGE_SE3"):
         read_relative_poses(tmp_path / "none.g2o", 5)

@@ -24,6 +24,7 @@ from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.measurements import MeasurementsConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.measurements.association import rows_of_frames
+from uni4d_fg.reading import read_text
 
 _AXIS_M = 6378137.0
 _FLATTENING = 1.0 / 298.257223563
@@ -116,10 +117,10 @@ def _read_columns(path: Path) -> tuple[dict[str, FloatArray], list[int]]:
     """Return the columns that count, (N,) each, and the line of each row."""
     expected = f"a header with timestamp and {','.join(_LOCAL)} or {','.join(_GEODETIC)}"
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream)
-            table = [(reader.line_num, fields) for fields in reader if fields and not fields[0].startswith("#")]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        text = read_text(path, what=f"a CSV file with {expected}").removeprefix("\ufeff")
+        reader = csv.reader(text.splitlines(keepends=True))
+        table = [(reader.line_num, fields) for fields in reader if fields and not fields[0].startswith("#")]
+    except csv.Error as error:
         raise InputError(f"{path}: cannot be read as CSV ({error}); expected {expected}") from error
     if not table:
         raise InputError(f"{path}: is empty; expected {expected}")

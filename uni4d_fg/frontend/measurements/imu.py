@@ -27,6 +27,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.yaml_text import parse_yaml
 from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.files import atomic_write_text
+from uni4d_fg.reading import read_text
 
 CSV_NAME, YAML_NAME = "imu.csv", "imu.yaml"
 _HEADER = "#timestamp [ns],w_x [rad s^-1],w_y [rad s^-1],w_z [rad s^-1],a_x [m s^-2],a_y [m s^-2],a_z [m s^-2]"
@@ -202,10 +203,7 @@ def write_imu(samples: ImuSamples, folder: Path) -> None:
 
 
 def _csv_rows(file: Path) -> FloatArray:
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read ({error}); give the CSV of an IMU, as EuRoC has it") from error
+    text = read_text(file, what="the CSV of an IMU, as EuRoC has it,").removeprefix("\ufeff")
     rows = []
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -232,8 +230,8 @@ def _device(file: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        read = parse_yaml(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ConfigError) as error:
+        read = parse_yaml(read_text(file))
+    except ConfigError as error:
         raise InputError(f"{file}: cannot be read ({error})") from error
     allowed = ("noise", "body_T_cam", "time_offset")
     if not isinstance(read, dict) or set(read) - set(allowed):

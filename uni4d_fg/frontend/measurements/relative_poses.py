@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.errors import InputError
+from uni4d_fg.reading import read_text
 
 EDGE_FORMAT = "EDGE_SE3:QUAT i j x y z qx qy qz qw and the 21 numbers of the information's upper triangle"
 _TAG = "EDGE_SE3:QUAT"
@@ -52,10 +53,7 @@ def read_relative_poses(path: Path, num_frames: int) -> tuple[RelativePoses, lis
         InputError: If the file cannot be read, an edge is malformed, or none is between two frames; the message names
             the line.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as g2o ({error}); expected lines of {EDGE_FORMAT}") from error
+    text = read_text(path, what=f"a g2o file with lines of {EDGE_FORMAT}")
     edges, other = [], 0
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.split()

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
+from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_write_text
+from uni4d_fg.reading import read_json
 
 ResultT = TypeVar("ResultT")
 
@@ -38,10 +40,10 @@ class ResultStore:
         path, adapter = self.folder / f"{name}.json", TypeAdapter(kind)
         if self.resume and path.is_file():
             try:
-                stored = json.loads(path.read_text(encoding="utf-8"))
+                stored = read_json(path)
                 if stored.get("key") == key:
                     return adapter.validate_python(stored["part"])
-            except (OSError, ValueError, KeyError, AttributeError, ValidationError):
+            except (InputError, ValueError, KeyError, AttributeError, RecursionError):
                 pass  # made again
         part = compute()
         text = json.dumps({"key": key, "part": adapter.dump_python(part, mode="json")})
