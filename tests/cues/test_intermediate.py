@@ -22,7 +22,11 @@ def cues(tmp_path: Path) -> Path:
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"x" * 10)
-    manifest = {"depth": [f"{LAST}/000000.map.npz"], "masks": [f"{MASKS}/000000.png"]}
+    manifest = {
+        "num_frames": 1, "image_size": [60, 80], "depth": [f"{LAST}/000000.map.npz"], "masks": [f"{MASKS}/000000.png"],
+        "static": False, "tracks": "tracks.npz", "intrinsics": [75.0, 75.0, 39.5, 29.5], "initial_world_T_cam": None,
+        "report": {},
+    }  # fmt: skip
     (tmp_path / "cues.json").write_text(json.dumps(manifest))
     return tmp_path
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
-from uni4d_fg.cues.manifest import MANIFEST
-from uni4d_fg.errors import InputError
+from uni4d_fg.cues.manifest import has_manifest, read_manifest
 from uni4d_fg.files import write_failure
 
 _FOLDERS = ("depth", "masks")
@@ -30,14 +28,10 @@ def drop_intermediate(folder: Path) -> int:
         InputError: If the manifest cannot be read.
         OutputError: If a file cannot be removed.
     """
-    path = folder / MANIFEST
-    if not path.is_file():
+    if not has_manifest(folder):
         return 0
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        used = {PurePosixPath(name).parent for kind in _FOLDERS for name in stored[kind] or ()}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); make the cues again with --resume") from error
+    stored = read_manifest(folder)
+    used = {PurePosixPath(name).parent for names in (stored.depth, stored.masks) for name in names or ()}
     removed = 0
     for kind in _FOLDERS:
         for made in sorted((folder / kind).glob("motion-*")):

@@ -35,7 +35,7 @@ class _Report(BaseModel):
     start: dict[str, Any] = {}
 
 
-class _Manifest(BaseModel):
+class Manifest(BaseModel):
     """What :func:`save_manifest` writes, as far as it is read; names are relative to the folder."""
 
     num_frames: int
@@ -84,6 +84,19 @@ def has_manifest(folder: Path) -> bool:
     return (folder / MANIFEST).is_file()
 
 
+def read_manifest(folder: Path) -> Manifest:
+    """Read which files of ``folder`` are cues. Raises InputError if it cannot be read, or is of another form."""
+    path = folder / MANIFEST
+    try:
+        return Manifest.model_validate(read_json(path, _MAX_BYTES))
+    except (ValidationError, RecursionError) as error:
+        what = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False)[0]
+            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise InputError(f"{path}: does not say what the cues are ({what}); make them again with --resume") from error
+
+
 def load_cues(video: Video, folder: Path) -> tuple[Sequence, CueReport]:
     """Open the cues that were made of a video.
 
@@ -94,15 +107,7 @@ def load_cues(video: Video, folder: Path) -> tuple[Sequence, CueReport]:
     Raises:
         InputError: If they are not all there, or are those of another video.
     """
-    path = folder / MANIFEST
-    try:
-        stored = _Manifest.model_validate(read_json(path, _MAX_BYTES))
-    except (ValidationError, RecursionError) as error:
-        what = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False)[0]
-            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise InputError(f"{path}: does not say what the cues are ({what}); make them again with --resume") from error
+    stored, path = read_manifest(folder), folder / MANIFEST
     if stored.num_frames != video.num_frames or stored.image_size != video.image_size:
         raise InputError(
             f"{path}: cues of {stored.num_frames} frames of {list(stored.image_size)} px, but {video.name} has "
