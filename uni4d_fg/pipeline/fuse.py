@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array, IntArray, evenly_spread
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.frames import FramesInTurn
@@ -25,16 +25,30 @@ from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.depth_store import write_depth
 from uni4d_fg.results.fusion.averaging import average_over_frames
+from uni4d_fg.results.fusion.bleeding import bleeding_radius
 from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.carried import carried_depth
+from uni4d_fg.results.fusion.cue_error import affine_log_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
+from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize, working_frame
-from uni4d_fg.results.fusion.static_depth import StaticDepth, fuse_static, known_depth, spread_at_landmarks
+from uni4d_fg.results.fusion.static_depth import StaticDepth, fuse_static, held_out_errors, known_depth
+from uni4d_fg.results.fusion.upsampling import upsample_guided
 from uni4d_fg.slam.reconstruction import zoomed
 
 _CARRIED_REACH, _CARRIED_FROM = 6, 2
 """A frame without a cue takes the depth of this many frames at most this far away."""
+_AVERAGED_SIGMA = (0.005, 0.06)
+"""Bounds of the standard deviation from which it is told which frames agree."""
+_SHARP_PX = 2.0
+"""The cue has the detail of edges if it bleeds no farther, working px."""
+_SURE = 0.8
+"""Matched depth of this confidence tells how far the cue bleeds."""
+_STILL = 0.6
+"""Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
+_BLED_SHARE = 2.0
+"""Moving things take their depth from this many times as far inside as the cue bleeds in the mean."""
 _EDGE = 0.04
 """Change of log depth over a pixel of the working size, from which on there may be an edge."""
 
@@ -93,7 +107,7 @@ def fuse_depth(
     if not unmatched and not maps.gains_by_matching():
         unmatched = "adds nothing to this cue, as landmarks say"
     # Anew, as the frames that were tried are not in order.
-    maps = replace(maps, unmatched=unmatched, matched=0, made={})
+    maps = replace(maps, unmatched=unmatched, matched=0, made={}, bled=[])
     with write_depth(path, sequence.num_frames, sequence.image_size) as writer:
         threads = thread_count()
         for first in range(0, sequence.num_frames, threads):
@@ -129,6 +143,12 @@ class DenseMaps:
     multiview: MultiviewDepth = field(init=False)
     matched: int = 0
     """Frames with depth from several views."""
+    bleeding_px: float = 0.0
+    """How far the cue bleeds across edges, working px."""
+    bled: list[float] = field(default_factory=list)
+    """The same of single frames."""
+    errors: list[float] = field(default_factory=list)
+    """Mean error to expect of static depth, of the frames that are done."""
     made: dict[int, tuple[StaticDepth, Float32Array]] = field(default_factory=dict)
     """Per frame: static depth, and the raw cue, at working size."""
 
@@ -145,6 +165,7 @@ class DenseMaps:
         sound = [frame for frame in range(self.sequence.num_frames) if frame not in self.broken]
         for at in evenly_spread(len(sound), _TRIED_FRAMES).tolist():
             self._static(sound[at])
+        self.bleeding_px = float(np.median(self.bled)) if self.bled else 0.0
         return self.matched > 0 or bool(self.broken)
 
     def _given(self, frame: int) -> Float32Array:
@@ -191,18 +212,55 @@ class DenseMaps:
                 if 0 <= other < len(poses)
             ),
             self._camera(frame),
-            self.config.averaged_sigmas * float(np.clip(np.nanmedian(static.sigma), 0.005, 0.03)),
+            self.config.averaged_sigmas * float(np.clip(np.nanmedian(static.sigma), *_AVERAGED_SIGMA)),
         ).depth
+        static_error = static.error[np.isfinite(static.log_depth) & ~self.size.marked(mask)]
+        self.errors += [float(static_error.mean())] if static_error.size else []
         full = self._lifted(frame, np.log(averaged), cue)
         if (mask > 0).any():
-            full = np.where(mask > 0, self._by_nearest_points(frame, mask), full)
+            # Masks reach beyond what moves: what other frames see there just the same stands still.
+            still = self.size.enlarge(static.matched) > _STILL
+            full = np.where((mask > 0) & ~still, np.exp(self._moving(frame)), full)
         return full
+
+    def _moving(self, frame: int) -> Float32Array:
+        """Return the log depth (H, W) of what moves; means nothing elsewhere."""
+        mask, mine = self.sequence.masks[frame], self.control[frame]
+        corrected, raw = self._static(frame)[0].corrected, self._given(frame)
+        log_depth = affine_log_depth(raw, corrected.scale, corrected.shift) + self.size.enlarge(corrected.field)
+        radius = self.bleeding_px / self.size.scale[0]
+        for label in np.unique(mask[mask > 0]).tolist():
+            pixels = mask == label
+            if frame in self.broken:
+                carried = carried_moving(pixels, self.sequence.images[frame], self._beside(frame, label))
+                log_depth = np.where(np.isfinite(carried), carried, log_depth)
+                continue
+            here = (mine.instance == label) & np.isfinite(mine.log_scale)
+            log_z = mine.log_scale[here] + np.log(mine.cue[here])
+            log_depth = correct_moving(log_depth, pixels, mine.uv[here], log_z, radius, self.config)
+            log_depth = without_bleeding(log_depth, pixels, _BLED_SHARE * radius)
+        return log_depth
+
+    def _beside(self, frame: int, label: int) -> list[tuple[ImageArray, Float32Array, BoolArray, float]]:
+        """Return image, log depth and pixels of an instance, and a weight, of the nearest frames with a sound cue."""
+        found: list[tuple[ImageArray, Float32Array, BoolArray, float]] = []
+        for side in (-1, 1):
+            for step in range(1, _CARRIED_REACH + 1):
+                other = frame + side * step
+                if not 0 <= other < len(self.control) or other in self.broken:
+                    continue
+                pixels = self.sequence.masks[other] == label
+                if pixels.any():
+                    found.append((self.sequence.images[other], self._moving(other), pixels, 1.0 / step))
+                    break
+        return found
 
     def _lifted(self, frame: int, log_depth: Float32Array, cue: Float32Array) -> Float32Array:
         """Bring static depth to the size of the image: at edges by correcting the cue, which has the detail."""
-        if frame in self.broken:
-            return np.exp(self.size.enlarge(log_depth))
         raw = self._given(frame)
+        if frame in self.broken or self.bleeding_px > _SHARP_PX:
+            guided = np.exp(upsample_guided(log_depth, self.sequence.images[frame]))
+            return np.where(np.isfinite(raw), guided, np.float32(np.nan))
         with np.errstate(invalid="ignore"):
             change = self.size.enlarge(log_depth - np.log(cue))
             detailed = np.log(raw) + change
@@ -242,14 +300,17 @@ class DenseMaps:
                 nearest = cue[row, column]
                 log_z = np.where(np.isfinite(nearest), mine.log_scale[usable] + np.log(nearest), log_z)
             static, log_scale = np.isfinite(shown.matched), float(self.scene["log_scale"][frame])
-            by_landmarks = known_depth(None, uv, log_z, static, cue.shape)
-            fused = fuse_static(cue, None, by_landmarks, log_scale, self.config)
-            if measured is not None:
-                known = known_depth(measured, uv, log_z, static, cue.shape)
-                # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
-                if known.landmark_spread < spread_at_landmarks(fused, by_landmarks):
-                    fused = fuse_static(cue, measured, known, log_scale, self.config)
-                    self.matched += 1
+            # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
+            errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config)
+            if not errors.prefer_matching:
+                measured = None
+            self.matched += measured is not None
+            known = known_depth(measured, uv, log_z, static, cue.shape)
+            fused = fuse_static(cue, measured, known, errors.cue, log_scale, self.config)
+            if measured is not None and not broken:
+                affine = affine_log_depth(cue, fused.corrected.scale, fused.corrected.shift)
+                bled = bleeding_radius(affine, np.log(measured.depth), static & (measured.confidence > _SURE))
+                self.bled += [bled] if np.isfinite(bled) else []
             self.made[frame] = fused, cue
         return self.made[frame]
 
@@ -280,6 +341,11 @@ class DenseMaps:
         out: dict[str, Any] = {"broken_frames": sorted(self.broken), "matched_frames": self.matched}
         done = f"in {self.matched} of {self.sequence.num_frames} frames"
         out["facts"] = [f"depth from several views {self.unmatched or done}"]
+        if self.errors:
+            out["depth_error"] = float(np.mean(self.errors))
+            out["facts"].append(
+                f"static depth is off by some {100 * out['depth_error']:.1f} % (estimated, but for scale)"
+            )
         if self.broken:
             out["warnings"] = [
                 f"the depth cue of {len(self.broken)} frame(s) contradicts what the other frames show; their depth was "

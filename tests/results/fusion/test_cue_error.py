@@ -8,7 +8,8 @@ from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.cue_error import KnownDepth, correct_cue, fit_affine
 from uni4d_fg.results.fusion.densify import ControlPoints
-from uni4d_fg.results.fusion.static_depth import StaticDepth, known_depth, spread_at_landmarks
+from uni4d_fg.results.fusion.multiview.measured import Measured
+from uni4d_fg.results.fusion.static_depth import fuse_static, held_out_errors, known_depth
 
 HEIGHT, WIDTH = 60, 80
 
@@ -68,15 +69,53 @@ def test_frames_that_contradict_the_scene_are_named_and_no_other(rng: np.random.
     assert contradicting_frames(frames(rng, set()), FusionConfig()) == []
 
 
-def test_landmarks_tell_which_depth_is_the_better_one(rng: np.random.Generator) -> None:
-    truth = np.log(room(rng)[0])
-    landmarks = rng.random(truth.shape) < 0.1
-    uv = np.argwhere(landmarks)[:, ::-1].astype(np.float64)
-    known = known_depth(None, uv, truth[landmarks].astype(np.float64), np.ones(truth.shape, bool), truth.shape)
-    sigma = np.full(truth.shape, 0.01, np.float32)
-    for noise in (0.005, 0.05):
-        seen = (truth + noise * rng.standard_normal(truth.shape)).astype(np.float32)
-        spread = spread_at_landmarks(StaticDepth(seen, sigma, 0.0), known)
-        assert abs(spread / noise - 1.0) < 0.15
-    nothing = known_depth(None, uv[:0], truth[:0, 0].astype(np.float64), np.ones(truth.shape, bool), truth.shape)
-    assert spread_at_landmarks(StaticDepth(truth, sigma, 0.0), nothing) == float("inf")
+def test_samples_that_err_alike_do_not_make_up_a_shift(rng: np.random.Generator) -> None:
+    """A smooth error looks like a shift over a small range of depth, and things nearer than that pay for it."""
+    error = {np.inf: 0.0, 0.08: 0.0}
+    for _ in range(20):
+        depth = rng.uniform(2.8, 3.6, 400)
+        slope = 0.08 * rng.standard_normal()
+        cue = depth * np.exp(slope * (depth - 3.2) / 0.4 + 0.02 * rng.standard_normal(400))
+        for shift_sigma in error:
+            a, b, _spread = fit_affine(cue, np.log(depth), np.ones(400), shift_sigma)
+            error[shift_sigma] += abs(float(np.log((a / 1.6 + b) * 1.6))) / 20
+    assert error[0.08] < 0.75 * error[np.inf]
+
+
+def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(rng: np.random.Generator) -> None:
+    depth, cue = room(rng)
+    truth = np.log(depth).astype(np.float64)
+    static, sigma = np.ones(depth.shape, bool), np.full(depth.shape, 0.004, np.float32)
+    places = np.argwhere(rng.random(depth.shape) < 0.2)
+    uv, log_z = places[:, ::-1].astype(np.float64), truth[places[:, 0], places[:, 1]]
+    noisy = (cue * np.exp(0.03 * rng.standard_normal(depth.shape))).astype(np.float32)
+    for error, better in ((0.005, True), (0.1, False)):
+        seen = np.exp(truth + error * rng.standard_normal(truth.shape)).astype(np.float32)
+        measured = Measured(seen, np.full(depth.shape, 0.95, np.float32), sigma)
+        assert held_out_errors(noisy, measured, uv, log_z, static, 0.0, FusionConfig()).prefer_matching is better
+    found = held_out_errors(noisy, None, uv, log_z, static, 0.0, FusionConfig())
+    known = known_depth(None, uv, log_z, static, (HEIGHT, WIDTH))
+    fused = fuse_static(noisy, None, known, found.cue, 0.0, FusionConfig())
+    true_error = float(np.abs(fused.log_depth - truth).mean())
+    assert 1 / 1.5 < float(fused.error.mean()) / true_error < 1.5
+
+
+def test_matched_depth_that_is_sure_wins_over_a_cue_that_is_wrong_and_says_so(rng: np.random.Generator) -> None:
+    depth, cue = room(rng)
+    truth = np.log(depth)
+    sure = np.full(depth.shape, 0.97, np.float32)
+    sure[:, :10] = 0.1
+    seen = np.where(sure > 0.5, truth + 0.004 * rng.standard_normal(truth.shape), truth + 0.5).astype(np.float32)
+    measured = Measured(np.exp(seen), sure, np.full(depth.shape, 0.004, np.float32))
+    bled = cue.copy()
+    bled[20:30, 30:50] *= 1.4
+    places = np.argwhere(rng.random(depth.shape) < 0.1)
+    uv, log_z = places[:, ::-1].astype(np.float64), truth[places[:, 0], places[:, 1]].astype(np.float64)
+    known = known_depth(measured, uv, log_z, np.ones(depth.shape, bool), (HEIGHT, WIDTH))
+    fused = fuse_static(bled, measured, known, 0.02, 0.0, FusionConfig())
+    error = np.abs(fused.log_depth - truth)
+    assert error[20:30, 30:50].mean() < 0.02
+    chosen = fused.confidence > 0.9
+    assert chosen.mean() > 0.5
+    assert (error[chosen] < 0.03).mean() > 0.95
+    assert not chosen[:, :5].any() or error[:, :5][chosen[:, :5]].mean() < 0.03

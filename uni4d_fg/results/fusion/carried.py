@@ -50,19 +50,19 @@ def carried_depth(
             nearest = np.zeros(height * width)
             nearest[at[order]] = 1.0 / z[inside][order]
             np.maximum(inverse, nearest, out=inverse)
-    filled = _filled(inverse.reshape(shape).astype(np.float32), inverse.reshape(shape) > 0)
+    filled = filled_smoothly(inverse.reshape(shape).astype(np.float32), inverse.reshape(shape) > 0)
     with np.errstate(divide="ignore"):
         return np.where(filled > 0, 1.0 / filled, np.nan).astype(np.float32)
 
 
-def _filled(inverse: Float32Array, known: BoolArray) -> Float32Array:
+def filled_smoothly(values: Float32Array, known: BoolArray) -> Float32Array:
     """Fill holes by averages over windows that grow until all is filled."""
-    radius, shape = 2.0, inverse.shape
+    radius, shape = 2.0, values.shape
     while known.any() and not known.all() and radius < 2 * max(shape):
         mass = cv2.GaussianBlur(known.astype(np.float32), (0, 0), radius)
-        mean = cv2.GaussianBlur(np.where(known, inverse, np.float32(0)), (0, 0), radius) / np.maximum(mass, 1e-6)
+        mean = cv2.GaussianBlur(np.where(known, values, np.float32(0)), (0, 0), radius) / np.maximum(mass, 1e-6)
         near = ~known & (mass > 0.05)
-        inverse = np.where(near, mean, inverse).astype(np.float32)
+        values = np.where(near, mean, values).astype(np.float32)
         known = known | near
         radius *= 2.0
-    return inverse
+    return values

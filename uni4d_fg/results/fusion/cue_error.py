@@ -22,6 +22,12 @@ _MAX_SAMPLES = 4000
 _ITERATIONS = 12
 _MIN_SAMPLES = 12
 _MAD = 1.4826
+_SHIFT_SIGMA = 0.08
+"""Standard deviation of the shift, of the median inverse depth, before anything is seen."""
+_INDEPENDENT = 30
+"""The smooth error makes samples alike: all of a frame say no more than this many on their own."""
+_FARTHEST = 0.02
+"""Least inverse depth, of the median one."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +48,24 @@ class CorrectedCue:
     """(h, w), NaN where the cue is missing."""
     spread: float
     """Spread of the affinely corrected cue's error over the frame (robust standard deviation of log depth)."""
+    scale: float
+    """a"""
+    shift: float
+    """b, 1/m."""
+    field: Float32Array
+    """(h, w) f, with the opposite sign."""
 
 
-def fit_affine(cue: FloatArray, log_depth: FloatArray, weight: FloatArray) -> tuple[float, float, float]:
+def fit_affine(
+    cue: FloatArray, log_depth: FloatArray, weight: FloatArray, shift_sigma: float = np.inf
+) -> tuple[float, float, float]:
     """Fit ``1 / z = a / cue + b`` robustly.
 
     Args:
         cue: (N,) m, positive.
         log_depth: (N,) of the same pixels.
         weight: (N,) not negative.
+        shift_sigma: Standard deviation of the shift before anything is seen, of the median inverse depth.
 
     Returns:
         a, b, and the robust standard deviation of the log depth that is left. A line that falls, or that makes depth
@@ -58,16 +73,19 @@ def fit_affine(cue: FloatArray, log_depth: FloatArray, weight: FloatArray) -> tu
     """
     inverse, wanted = 1.0 / cue, np.exp(-log_depth)
     scale = float(np.exp(-_weighted_median(log_depth - np.log(cue), weight)))
+    typical = float(np.median(wanted))
     a, b = scale, 0.0
     for _ in range(_ITERATIONS):
         left = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
         sigma = max(_MAD * _weighted_median(np.abs(left), weight), 1e-4)
         # Relative residuals: an error of inverse depth counts by how deep it is.
         w = weight / (1.0 + (left / (2.0 * sigma)) ** 2) ** 2 / wanted**2
-        total = w.sum()
+        # One more sample, of no inverse depth at none: without evidence there is no shift.
+        least = (sigma / (shift_sigma * typical)) ** 2 * weight.sum() / _INDEPENDENT
+        total = w.sum() + least
         x, y = (w * inverse).sum() / total, (w * wanted).sum() / total
-        spread = (w * (inverse - x) ** 2).sum()
-        slope = (w * (inverse - x) * (wanted - y)).sum() / max(spread, 1e-12 * total)
+        spread = (w * (inverse - x) ** 2).sum() + least * x**2
+        slope = ((w * (inverse - x) * (wanted - y)).sum() + least * x * y) / max(spread, 1e-12 * total)
         shift = y - slope * x
         if slope <= 0.2 * scale or slope > 5.0 * scale or (slope * inverse + shift).min() <= 0.1 * wanted.min():
             slope, shift = scale, 0.0
@@ -91,25 +109,45 @@ def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, 
     usable = np.isfinite(cue) & (known.weight > 0) & np.isfinite(known.log_depth)
     rows, columns = np.nonzero(usable)
     if len(rows) < _MIN_SAMPLES:
-        return CorrectedCue(np.log(cue) + np.float32(default_log_scale), np.nan)
+        nothing, scale = np.zeros_like(cue), float(np.exp(-default_log_scale))
+        return CorrectedCue(np.log(cue) + np.float32(default_log_scale), np.nan, scale, 0.0, nothing)
     some = evenly_spread(len(rows), _MAX_SAMPLES)
     at = rows[some], columns[some]
     a, b, spread = fit_affine(
-        cue[at].astype(np.float64), known.log_depth[at].astype(np.float64), known.weight[at].astype(np.float64)
+        cue[at].astype(np.float64),
+        known.log_depth[at].astype(np.float64),
+        known.weight[at].astype(np.float64),
+        _SHIFT_SIGMA,
     )
-    inverse = np.float32(a) / cue + np.float32(b)
-    typical = 1.0 / float(np.exp(np.median(known.log_depth[at])))
-    log_depth = -np.log(np.maximum(inverse, np.float32(0.02 * typical)))
+    log_depth = affine_log_depth(cue, a, b)
     residual = np.where(usable, known.log_depth - log_depth, np.float32(0))
     weight = np.where(usable & (np.abs(residual) < 4.0 * spread + 0.02), known.weight, np.float32(0))
-    field = np.zeros_like(cue)
-    width = cue.shape[1]
+    field = smooth_field(residual, weight, config)
+    return CorrectedCue(log_depth + field, spread, a, b, field)
+
+
+def affine_log_depth(cue: Float32Array, scale: float, shift: float) -> Float32Array:
+    """Return ``-log(scale / cue + shift)`` (h, w); what would be beyond all bounds is bounded by a far depth."""
+    inverse = np.float32(scale) / cue + np.float32(shift)
+    farthest = np.float32(_FARTHEST * np.nanmedian(inverse))
+    return np.asarray(-np.log(np.maximum(inverse, farthest)), dtype=np.float32)
+
+
+def smooth_field(residual: Float32Array, weight: Float32Array, config: FusionConfig) -> Float32Array:
+    """Average what is left over Gaussian windows, wide ones first, (h, w).
+
+    Args:
+        residual: (h, w) of log depth; any finite value where the weight is 0.
+        weight: (h, w) not negative.
+        config: Windows, and the strength of the wider window where little is known.
+    """
+    field = np.zeros_like(residual)
     for share in config.field_windows:
-        sigma_px = share * width
+        sigma_px = share * residual.shape[1]
         mass = cv2.GaussianBlur(weight, (0, 0), sigma_px)
         pull = cv2.GaussianBlur(weight * (residual - field), (0, 0), sigma_px)
         field = field + pull / (mass + np.float32(config.field_prior))
-    return CorrectedCue(log_depth + field, spread)
+    return field
 
 
 def _weighted_median(values: FloatArray, weight: FloatArray) -> float:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.special import erf
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.results.fusion.cue_error import KnownDepth, correct_cue
+from uni4d_fg.results.fusion.cue_error import CorrectedCue, KnownDepth, correct_cue
 from uni4d_fg.results.fusion.multiview.measured import Measured
 
 _LANDMARK_SIGMA = 0.006
@@ -17,9 +19,22 @@ _LANDMARK_SIGMA = 0.006
 _LANDMARK_SHARE = 0.5
 """Weight of a landmark beside a sure match."""
 _SURE = 0.8
+_WRONG_ERROR = 0.15
+"""Mean absolute error of log depth where it is wrong, on scenes with truth."""
+_RIGHT = 0.03
+_MEAN_TO_SIGMA = 1.2533
+"""Standard deviation over mean absolute error, of a normal distribution."""
+_SHARED_ERROR = 1.5
+"""Landmarks beside each other err alike, so that a cue fitted to some predicts others better than its error is."""
+_FITTED_ERROR = 1.2
+"""Its error over that at landmarks beside those that it was fitted to, on scenes with truth."""
+_TRACKED_PX = 5
+"""Half a tracking window, working px."""
 _MIN_COMPARED = 20
 """Landmarks on sure matches that a comparison takes; with fewer, matched depth is taken to be off by ..."""
 _UNCHECKED_SIGMA = 0.05
+_HELD_OUT = 0.25
+"""Part of the landmarks that judge whether the cue or matching is better."""
 _AGREES = 0.04
 _AT_WORST, _AT_BEST = 0.75, 0.92
 """Parts of the landmarks that agree with sure matches to that log depth: with the first nothing is believed of them."""
@@ -48,9 +63,15 @@ class StaticDepth:
     log_depth: Float32Array
     """NaN where nothing is known."""
     sigma: Float32Array
-    """Standard deviation of its error, as far as it is known."""
-    spread: float
-    """How much the cue disagrees with what is known; NaN where next to nothing is."""
+    """Standard deviation of its error where it is right."""
+    error: Float32Array
+    """Mean absolute error to expect, wrong matches among them."""
+    confidence: Float32Array
+    """Probability that it is right to 3 %."""
+    corrected: CorrectedCue
+    """The cue alone."""
+    matched: Float32Array
+    """Confidence in matched depth alone; 0 where there is none."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +83,6 @@ class Known:
     """Standard deviation of the error of matched log depth that neighboring pixels share."""
     reliability: float
     """0 to 1: how far the confidence in matched depth is to be believed in this frame."""
-    landmark_spread: float = np.inf
-    """Standard deviation of what matched log depth differs from landmarks by; infinite where too few compare."""
 
 
 def known_depth(
@@ -88,11 +107,11 @@ def known_depth(
     at, log_z = (row[inside], column[inside]), log_z[inside]
     log_depth = np.full(shape, np.nan, np.float32)
     weight = np.zeros(shape, np.float32)
-    shared, reliability, spread = 0.0, 0.0, float("inf")
+    shared, reliability = 0.0, 0.0
     if measured is not None:
         log_depth = np.log(measured.depth)
         weight = np.where(static, np.maximum(measured.confidence - 0.5, 0) * 2, np.float32(0)).astype(np.float32)
-        sure = measured.confidence[at] > _SURE
+        sure = (measured.confidence[at] > _SURE) & ~_beside_edges(measured)[at]
         shared = _UNCHECKED_SIGMA
         if np.count_nonzero(sure) >= _MIN_COMPARED:
             difference = log_depth[at][sure] - log_z[sure]
@@ -107,13 +126,14 @@ def known_depth(
     at = at[0][trusted], at[1][trusted]
     log_depth[at] = log_z[trusted]
     weight[at] = _LANDMARK_SHARE
-    return Known(KnownDepth(log_depth, weight), shared, reliability, spread)
+    return Known(KnownDepth(log_depth, weight), shared, reliability)
 
 
 def fuse_static(
     cue: Float32Array,
     measured: Measured | None,
     known: Known,
+    cue_error: float,
     default_log_scale: float,
     config: FusionConfig,
 ) -> StaticDepth:
@@ -123,15 +143,18 @@ def fuse_static(
         cue: (h, w) m, NaN where missing.
         measured: Depth from several views, if there is any.
         known: What the cue is corrected by.
+        cue_error: Mean error of the corrected log cue, as held-out landmarks tell; NaN where they do not.
         default_log_scale: Of the frame, where next to nothing is known.
         config: Fusion.
     """
     shape = known.depth.weight.shape
     corrected = correct_cue(cue, known.depth, default_log_scale, config)
     if measured is None or known.reliability == 0.0:
-        spread = corrected.spread if np.isfinite(corrected.spread) else _UNCOMPARED_SIGMA
+        spread = _MEAN_TO_SIGMA * cue_error if np.isfinite(cue_error) else _UNCOMPARED_SIGMA
         sigma = np.full(shape, max(spread, _LANDMARK_SIGMA), np.float32)
-        return StaticDepth(corrected.log_depth, sigma, corrected.spread)
+        sure = _within(sigma) * np.isfinite(corrected.log_depth)
+        error = sigma / np.float32(_MEAN_TO_SIGMA)
+        return StaticDepth(corrected.log_depth, sigma, error, sure.astype(np.float32), corrected, np.zeros_like(sigma))
     cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
     has_cue = np.isfinite(corrected.log_depth)
     seen = np.log(measured.depth)
@@ -147,22 +170,79 @@ def fuse_static(
     gain = np.where(has_cue, gain, 1.0)
     log_depth = np.where(has_cue, np.where(has_cue, corrected.log_depth, 0) + gain * difference, seen)
     sigma = np.hypot((1 - gain) * cue_sigma, gain * matched)
-    # The part of the time that the choice is wrong: a mean absolute error of its own.
-    sigma = np.where(has_cue | (p > 0.5), sigma, np.float32(_WRONG_SIGMA))
-    return StaticDepth(log_depth.astype(np.float32), sigma.astype(np.float32), corrected.spread)
+    # What the explanation that was chosen has of all, and the depth of the others would be wrong.
+    chosen = np.maximum(both, np.maximum(match_alone, cue_alone))
+    neither = (1 - p) * (1 - cue_right) * _normal(difference, np.full_like(difference, 2 * _WRONG_SIGMA**2))
+    share = np.where(has_cue, chosen / (both + match_alone + cue_alone + neither), p)
+    sure = share * _within(sigma)
+    error = share * sigma / _MEAN_TO_SIGMA + (1 - share) * _WRONG_ERROR
+    return StaticDepth(
+        log_depth.astype(np.float32), sigma.astype(np.float32), error.astype(np.float32), sure.astype(np.float32),
+        corrected, measured.confidence,
+    )  # fmt: skip
 
 
-def spread_at_landmarks(static: StaticDepth, known: Known) -> float:
-    """Return by how much (standard deviation, log) depth differs from landmarks; infinite without any.
+def _within(sigma: Float32Array) -> Float32Array:
+    """Return the probability (h, w) that log depth of this standard deviation is right to 3 %."""
+    return np.asarray(erf(_RIGHT / (np.sqrt(2.0) * sigma)), dtype=np.float32)
+
+
+class HeldOut(NamedTuple):
+    """Mean errors of log depth at landmarks that were held out; NaN where too few are."""
+
+    cue: float
+    """Of the cue that the other landmarks have corrected, everywhere; of the true error, as far as it is known."""
+    prefer_matching: bool
+    """Whether matched depth predicts them better than that cue, where it is sure."""
+
+
+def held_out_errors(
+    cue: Float32Array,
+    measured: Measured | None,
+    uv: FloatArray,
+    log_z: FloatArray,
+    static: BoolArray,
+    default_log_scale: float,
+    config: FusionConfig,
+) -> HeldOut:
+    """Judge the corrected cue and matched depth by landmarks that neither has seen.
+
+    A cue that was fitted to many landmarks agrees with them however wrong it is in between.
 
     Args:
-        static: Depth.
-        known: Landmarks alone.
+        cue: (h, w) m, NaN where missing.
+        measured: Depth from several views, if there is any.
+        uv: (N, 2) landmarks, working px.
+        log_z: (N,) their log depth.
+        static: (h, w) where nothing moves.
+        default_log_scale: Of the frame, where next to nothing is known.
+        config: Fusion.
     """
-    compared = (known.depth.weight > 0) & np.isfinite(static.log_depth)
-    if not compared.any():
-        return float("inf")
-    return 1.4826 * float(np.median(np.abs(known.depth.log_depth[compared] - static.log_depth[compared])))
+    held = np.random.default_rng(0).random(len(log_z)) < _HELD_OUT
+    shape = (cue.shape[0], cue.shape[1])
+    others = known_depth(None, uv[~held], log_z[~held], static, shape)
+    corrected = correct_cue(cue, others.depth, default_log_scale, config).log_depth
+    judges = known_depth(None, uv[held], log_z[held], static, shape).depth
+
+    def mean_error(log_depth: Float32Array, where: BoolArray) -> float:
+        difference = np.minimum(np.abs(log_depth[where] - judges.log_depth[where]), _WRONG_SIGMA)
+        return float(difference.mean()) if len(difference) >= _MIN_COMPARED else float("nan")
+
+    compared = (judges.weight > 0) & np.isfinite(corrected)
+    of_cue = _FITTED_ERROR * mean_error(corrected, compared)
+    if measured is None:
+        return HeldOut(of_cue, False)
+    # Tracking windows reach across edges: landmarks beside them bleed as a cue does.
+    beside = cv2.dilate(_beside_edges(measured).astype(np.uint8), np.ones((2 * _TRACKED_PX + 1,) * 2, np.uint8)) > 0
+    sure = compared & ~beside & (measured.confidence > _SURE)
+    return HeldOut(of_cue, mean_error(np.log(measured.depth), sure) < _SHARED_ERROR * mean_error(corrected, sure))
+
+
+def _beside_edges(measured: Measured) -> BoolArray:
+    """Return where matching, which blurs edges by its window, may have mixed two surfaces, (h, w)."""
+    seen = np.log(measured.depth)
+    window = np.ones((2 * _BLUR_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.dilate(seen, window) - cv2.erode(seen, window) > _EDGE)
 
 
 def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tuple[Float32Array, Float32Array]:
@@ -171,10 +251,7 @@ def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tup
     Matching blurs edges by its window, so that pixels beside an edge of the matched depth do not witness against
     the cue; those a little farther away do: a cue that bleeds across edges is found out there.
     """
-    seen = np.log(measured.depth)
-    window = np.ones((2 * _BLUR_PX + 1,) * 2, np.uint8)
-    beside = cv2.dilate(seen, window) - cv2.erode(seen, window) > _EDGE
-    usable = np.isfinite(log_cue) & (known.depth.weight > 0) & ~beside
+    usable = np.isfinite(log_cue) & (known.depth.weight > 0) & ~_beside_edges(measured)
     left = np.where(usable, np.abs(known.depth.log_depth - log_cue), np.float32(0))
     if not usable.any():
         return np.full_like(log_cue, 0.05), np.full_like(log_cue, _USUALLY_RIGHT)

@@ -1,0 +1,54 @@
+"""How far a depth cue bleeds across edges, measured against depth whose edges are where they should be."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array
+
+_EDGE = 0.15
+"""Change of log depth over two pixels that is an edge."""
+_LONGEST = 0.09
+"""Bleeding reaches no farther than this part of the width."""
+_ENDS = 0.15
+"""It ends where it is this part of what it is beside the edge."""
+_LEAST = 0.02
+"""Less beside the edge is none."""
+_MIN_PIXELS = 30
+
+
+def bleeding_radius(log_cue: Float32Array, log_depth: Float32Array, sure: BoolArray) -> float:
+    """Measure how far a cue bleeds across depth edges.
+
+    Bleeding makes what is near beside an edge too far, and what is far too near; other errors do not know which is
+    which, and cancel in the mean over the edges of a frame.
+
+    Args:
+        log_cue: (h, w) affinely corrected, NaN where missing.
+        log_depth: (h, w) of the static scene from several views.
+        sure: (h, w) where that is to be believed.
+
+    Returns:
+        Working px, 0 if it does not bleed; NaN if the frame has no edges that tell.
+    """
+    window = np.ones((3, 3), np.uint8)
+    edge = (cv2.dilate(log_depth, window) - cv2.erode(log_depth, window) > _EDGE) & sure
+    if not edge.any():
+        return float("nan")
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 3)
+    reach = max(3, round(_LONGEST * log_cue.shape[1]))
+    around = cv2.blur(log_depth, (2 * reach + 1,) * 2)
+    usable = sure & np.isfinite(log_cue)
+    inwards = (log_depth - np.where(usable, log_cue, np.float32(0))) * np.sign(log_depth - around)
+    bins = np.minimum(distance[usable], reach).astype(np.int64)
+    count = np.bincount(bins, minlength=reach + 1)[:reach]
+    total = np.bincount(bins, inwards[usable], minlength=reach + 1)[:reach]
+    if (count < _MIN_PIXELS).any():
+        return float("nan")
+    profile = total / count
+    peak = float(profile[:3].max())
+    if peak < _LEAST:
+        return 0.0
+    below = np.flatnonzero(profile < max(_ENDS * peak, 0.5 * _LEAST))
+    return float(below[0] if len(below) else reach)
