@@ -150,10 +150,11 @@ def fuse_static(
     shape = known.depth.weight.shape
     corrected = correct_cue(cue, known.depth, default_log_scale, config)
     if measured is None or known.reliability == 0.0:
-        spread = _MEAN_TO_SIGMA * cue_error if np.isfinite(cue_error) else _UNCOMPARED_SIGMA
-        sigma = np.full(shape, max(spread, _LANDMARK_SIGMA), np.float32)
-        sure = _within(sigma) * np.isfinite(corrected.log_depth)
-        error = sigma / np.float32(_MEAN_TO_SIGMA)
+        # The cue errs less where landmarks have corrected it, but frames are compared everywhere.
+        usual = corrected.spread if np.isfinite(corrected.spread) else _UNCOMPARED_SIGMA
+        sigma = np.full(shape, max(usual, _LANDMARK_SIGMA), np.float32)
+        error = np.full(shape, cue_error if np.isfinite(cue_error) else usual / _MEAN_TO_SIGMA, np.float32)
+        sure = _within(_MEAN_TO_SIGMA * error) * np.isfinite(corrected.log_depth)
         return StaticDepth(corrected.log_depth, sigma, error, sure.astype(np.float32), corrected, np.zeros_like(sigma))
     cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
     has_cue = np.isfinite(corrected.log_depth)
