@@ -39,6 +39,7 @@ from uni4d_fg.slam.reconstruction import zoomed
 
 _CARRIED_REACH, _CARRIED_FROM = 6, 2
 """A frame without a cue takes the depth of this many frames at most this far away."""
+_BESIDE = tuple(range(1, _CARRIED_REACH + 1))
 _AVERAGED_SIGMA = (0.005, 0.06)
 """Bounds of the standard deviation from which it is told which frames agree."""
 _SHARP_PX = 2.0
@@ -107,7 +108,7 @@ def fuse_depth(
     if not unmatched and not maps.gains_by_matching():
         unmatched = "adds nothing to this cue, as landmarks say"
     # Anew, as the frames that were tried are not in order.
-    maps = replace(maps, unmatched=unmatched, matched=0, made={}, bled=[])
+    maps = replace(maps, unmatched=unmatched, matched=0, made={}, bled=[], errors={})
     with write_depth(path, sequence.num_frames, sequence.image_size) as writer:
         threads = thread_count()
         for first in range(0, sequence.num_frames, threads):
@@ -147,8 +148,8 @@ class DenseMaps:
     """How far the cue bleeds across edges, working px."""
     bled: list[float] = field(default_factory=list)
     """The same of single frames."""
-    errors: list[float] = field(default_factory=list)
-    """Mean error to expect of static depth, of the frames that are done."""
+    errors: dict[int, float] = field(default_factory=dict)
+    """Frames that are done, to the mean error to expect of their static depth."""
     made: dict[int, tuple[StaticDepth, Float32Array]] = field(default_factory=dict)
     """Per frame: static depth, and the raw cue, at working size."""
 
@@ -183,7 +184,7 @@ class DenseMaps:
         near = {
             frame + sign * offset
             for frame in frames
-            for offset in (0, *self.config.averaged_offsets)
+            for offset in (0, *self.config.averaged_offsets, *(_BESIDE if frame in self.broken else ()))
             for sign in (-1, 1)
         }
         wanted = sorted(number for number in near if 0 <= number < self.sequence.num_frames and number not in self.made)
@@ -215,7 +216,8 @@ class DenseMaps:
             self.config.averaged_sigmas * float(np.clip(np.nanmedian(static.sigma), *_AVERAGED_SIGMA)),
         ).depth
         static_error = static.error[np.isfinite(static.log_depth) & ~self.size.marked(mask)]
-        self.errors += [float(static_error.mean())] if static_error.size else []
+        if static_error.size:
+            self.errors[frame] = float(static_error.mean())
         full = self._lifted(frame, np.log(averaged), cue)
         if (mask > 0).any():
             # Masks reach beyond what moves: what other frames see there just the same stands still.
@@ -342,7 +344,7 @@ class DenseMaps:
         done = f"in {self.matched} of {self.sequence.num_frames} frames"
         out["facts"] = [f"depth from several views {self.unmatched or done}"]
         if self.errors:
-            out["depth_error"] = float(np.mean(self.errors))
+            out["depth_error"] = float(np.mean([self.errors[frame] for frame in sorted(self.errors)]))
             out["facts"].append(
                 f"static depth is off by some {100 * out['depth_error']:.1f} % (estimated, but for scale)"
             )

@@ -129,6 +129,8 @@ def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, 
 def affine_log_depth(cue: Float32Array, scale: float, shift: float) -> Float32Array:
     """Return ``-log(scale / cue + shift)`` (h, w); what would be beyond all bounds is bounded by a far depth."""
     inverse = np.float32(scale) / cue + np.float32(shift)
+    if not np.isfinite(inverse).any():
+        return np.full_like(inverse, np.nan)
     farthest = np.float32(_FARTHEST * np.nanmedian(inverse))
     return np.asarray(-np.log(np.maximum(inverse, farthest)), dtype=np.float32)
 

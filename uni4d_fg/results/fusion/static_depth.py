@@ -185,7 +185,7 @@ def fuse_static(
 
 def _within(sigma: Float32Array) -> Float32Array:
     """Return the probability (h, w) that log depth of this standard deviation is right to 3 %."""
-    return np.asarray(erf(_RIGHT / (np.sqrt(2.0) * sigma)), dtype=np.float32)
+    return np.asarray(erf(_RIGHT / (np.sqrt(2.0) * np.maximum(sigma, 1e-6))), dtype=np.float32)
 
 
 class HeldOut(NamedTuple):
