@@ -96,8 +96,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--set", nargs="*", default=[], help="changes of the configuration")
     arguments = parser.parse_args()
-    joining = load_config(None, ["bundle_adjustment.rejoin.enabled=true", *arguments.set])
-    apart = load_config(None, ["bundle_adjustment.rejoin.enabled=false", *arguments.set])
+    joining = load_config(None, ["bundle_adjustment.rejoin.enabled=on", *arguments.set])
+    apart = load_config(None, ["bundle_adjustment.rejoin.enabled=off", *arguments.set])
     for seed in range(arguments.seeds):
         whole = make_synthetic_sequence(SyntheticSceneConfig(num_frames=arguments.frames, seed=seed))
         occluded = pass_bar(whole, arguments.hidden)

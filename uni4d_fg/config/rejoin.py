@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from uni4d_fg.config.base import Section, setting
 
 
 class RejoinConfig(Section):
     """Static tracks that ended (occlusion, blur, a look away) and were started anew at the same point."""
 
-    enabled: bool = setting(
-        False,
+    enabled: Literal["auto", "on", "off"] = setting(
+        "auto",
         "Join fragments between the two solves of bundle adjustment, so that the second one has one landmark for each "
-        "point. One graph with energy 'map' and measured noise only; not in windows and streams.",
+        "point; 'auto' where many tracks were cut. One graph with energy 'map' and measured noise only; not in windows "
+        "and streams.",
+    )
+    auto_part: float = setting(
+        0.15, "'auto' joins if this part of the landmarks may be a fragment by their positions.", gt=0, lt=1
     )
     max_distance_px: float = setting(
         3.0, "Landmarks farther apart than this in the frame where the later track starts are not compared, px.", gt=0

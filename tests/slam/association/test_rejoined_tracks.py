@@ -56,7 +56,7 @@ def solve(sequence: Sequence, *, searching: bool, images: np.ndarray | None = No
     labelled = label_tracks(sequence.tracks, sequence, config.labels, config.input)
     if images is not None:
         sequence = dataclasses.replace(sequence, images=ArrayFrames(images))
-    search = FragmentSearch.of(sequence, labelled, RejoinConfig(enabled=searching))
+    search = FragmentSearch.of(sequence, labelled, RejoinConfig(enabled="auto" if searching else "off"))
     asked: list[tuple[State, Observations, StaticNoise, np.ndarray]] = []
 
     def keep(state: State, observations: Observations, noise: StaticNoise) -> np.ndarray:
@@ -104,6 +104,13 @@ def test_joins_are_right_even_where_points_are_dense_and_few_pixels_are_left() -
     recall, precision = shares(occluded()[1], joined())
     assert precision >= 0.99
     assert recall >= 0.55
+
+
+def test_where_no_track_was_cut_auto_compares_nothing() -> None:
+    whole = occluded()[0]
+    result = solve(whole, searching=True, images=np.zeros((0, 1, 1), np.uint8))
+    assert np.array_equal(result.name, result.observations.rows()[0])
+    assert result.scene.joined == 0
 
 
 @pytest.mark.slow

@@ -35,12 +35,15 @@ class FragmentSearch:
     @classmethod
     def of(cls, sequence: Sequence, labelled: LabelledTracks, config: RejoinConfig) -> FragmentSearch | None:
         """Return the search in a sequence's images, with tracks as they lie there; None if it is switched off."""
-        return cls(sequence.images, labelled.tracks.uv, config) if config.enabled else None
+        return cls(sequence.images, labelled.tracks.uv, config) if config.enabled != "off" else None
 
     def __call__(self, state: State, observations: Observations, noise: StaticNoise) -> IntArray:
         """Return the track that names the point of each landmark, (N,)."""
         tracks, _ = observations.rows()
         pairs = find_candidates(state, observations, noise, self.config)
+        involved = len(np.unique(np.concatenate([pairs.earlier, pairs.later])))
+        if self.config.enabled == "auto" and involved < self.config.auto_part * len(tracks):
+            return tracks
         seen = compare(self.images, self.raw_uv, state, observations, pairs, self.config)
         alike = (seen.correlation >= self.config.min_correlation) & (seen.offset_px <= self.config.max_offset_px)
         probability = pair_probability(pairs, association_cost(pairs, seen, self.config))
