@@ -19,7 +19,7 @@ from uni4d_fg.factors.variable import variable_type
 from uni4d_fg.optim.cluster_robust import Spread
 from uni4d_fg.slam.incremental.model import DynamicPoints, FinishedFrame, FrameStatus, Landmarks
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor, PendingFrame
-from uni4d_fg.slam.incremental.window import KeyedPrior
+from uni4d_fg.slam.incremental.window import KeyedPrior, no_observations
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
@@ -70,6 +70,9 @@ def state_arrays(solver: IncrementalReconstructor) -> Arrays:
     out["pending_keyframe"] = np.array([p.keyframe for p in pending], dtype=np.int64)
     out["pending_keyframe_T_cam"] = np.array([p.keyframe_T_cam for p in pending]).reshape(-1, 4, 4)
     out["pending_covariance"] = np.array([p.covariance for p in pending]).reshape(-1, 6, 6)
+    for name in _OBSERVATIONS:
+        rows = [getattr(p.seen, name) for p in pending]
+        out[f"pending_observed_{name}"] = np.concatenate([getattr(no_observations(), name), *rows])
     out |= _points_arrays("pending", [p.dynamic for p in pending])
     out["num_frames"] = np.array(solver.num_frames)
     out["last_timestamp"], out["last_pose"] = np.array(solver.last_timestamp), solver.last_pose
@@ -122,12 +125,14 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
     tracker.next_track, tracker.since_query = (int(n) for n in arrays["tracker_counters"].tolist())
     tracker.previous = arrays.get("tracker_previous")
     points = _points_list("pending", arrays)
+    seen = Observations(*(arrays[f"pending_observed_{name}"] for name in _OBSERVATIONS))
     solver.pending = [
         PendingFrame(
             int(arrays["pending_frame"][i]), float(arrays["pending_timestamp"][i]),
             FrameStatus(str(arrays["pending_status"][i])), int(arrays["pending_keyframe"][i]),
             arrays["pending_keyframe_T_cam"][i], arrays["pending_covariance"][i],
             float(arrays["pending_log_scale"][i]), points[i],
+            seen.select(seen.frame == int(arrays["pending_frame"][i])),
         )
         for i in range(len(arrays["pending_frame"]))
     ]  # fmt: skip

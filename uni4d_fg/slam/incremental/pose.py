@@ -17,6 +17,7 @@ from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.slam.incremental.labels import LabelledFrame
+from uni4d_fg.slam.incremental.point_errors import PointErrors
 from uni4d_fg.slam.stages.bundle_adjustment import depth_prior_terms, reprojection_term
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.lifting import frame_log_scales
@@ -68,6 +69,7 @@ def locate(
     config: Config,
     run: StageRunner,
     log_scale: float = 0.0,
+    errors: PointErrors | None = None,
 ) -> FramePose:
     """Solve a frame's pose and log-scale with the points held, from each guess; the most inliers win.
 
@@ -80,6 +82,7 @@ def locate(
         config: Stage 2's kernels and outlier rule, and the pose solver.
         run: What solves the declared stage.
         log_scale: What the depth cues of all frames share; the prior on the frame's own is about it.
+        errors: How uncertain the points are; exact when None.
     """
     zero = np.zeros(len(points), dtype=np.int64)
     observations = Observations(np.arange(len(points)), zero, tracks.uv, tracks.depth, tracks.weight)
@@ -107,12 +110,15 @@ def locate(
     marginals = camera_marginals(stage.problem, state, stage.solver, None)
     if marginals is None:
         return FramePose(state[POSE][0], float(state[LOG_SCALE][0, 0]), inlier, np.full((6, 6), np.nan))
-    covariance = marginals.blocks(POSE, 1)[0]
+    model = covariance = marginals.blocks(POSE, 1)[0]
     clusters = track_cells(observations, intrinsics, ba)
     shared = None if clusters is None else clustered_marginals(stage.problem, state, stage.solver, clusters)
     if shared is not None:
         # The points are uncertain too, and cells are few: neither figure is trusted where it is the smaller one.
         covariance = larger_covariance(covariance, shared.blocks(POSE, 1)[0])
+    if errors is not None:
+        cells = observations.track if clusters is None else clusters.of_landmark
+        covariance = covariance + errors.spread(stage.problem.batches[0], state, model, cells)
     return FramePose(state[POSE][0], float(state[LOG_SCALE][0, 0]), inlier, covariance)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,8 +33,9 @@ from uni4d_fg.slam.incremental.pose import FramePose, locate, predict, refocused
 from uni4d_fg.slam.incremental.results import Results, ResultsInMemory, assemble_results
 from uni4d_fg.slam.incremental.smoother import make_smoother
 from uni4d_fg.slam.incremental.tracking import OnlineTracker
-from uni4d_fg.slam.incremental.window import CameraWindow, LeftKeyframe, LeftLandmarks
+from uni4d_fg.slam.incremental.window import CameraWindow, LeftKeyframe, LeftLandmarks, no_observations
 from uni4d_fg.slam.reconstruction import Reconstruction
+from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
 
@@ -54,6 +55,9 @@ class PendingFrame:
     log_scale: float
     dynamic: DynamicPoints
     """In the axes of its camera."""
+    seen: Observations = field(default_factory=no_observations)
+    """What it was posed by, kept before the focal lengths are known: it is then posed again before it leaves.
+    ``frame`` is its number."""
 
 
 class IncrementalReconstructor:
@@ -177,6 +181,8 @@ class IncrementalReconstructor:
             with self._timed("covariance"):
                 self.window.update_covariance()
             while self.smoother.must_slide(self.window):
+                with self._timed("pose"):
+                    self._pose_again(0)
                 with self._timed("marginalize"):
                     oldest, gone = self.window.slide()
                 left.append(oldest)
@@ -206,6 +212,8 @@ class IncrementalReconstructor:
         if self.num_frames:
             self._boundary.close()
         window = self.window
+        for row in range(len(window)):
+            self._pose_again(row)
         frames = [finished for row in range(len(window)) for finished in self._finish_keyframe(window.keyframe(row))]
         landmarks: tuple[Landmarks, ...] = ()
         if len(window.landmark_track):
@@ -236,8 +244,9 @@ class IncrementalReconstructor:
         )  # fmt: skip
         guesses = [self._predicted(frame), self.last_pose]
         found = locate(
-            guesses, chosen, points[usable], window.intrinsics, window.noise, self.config, self._run, window.cue_scale
-        )
+            guesses, chosen, points[usable], window.intrinsics, window.noise, self.config, self._run, window.cue_scale,
+            window.point_errors(chosen.track, points[usable]),
+        )  # fmt: skip
         count = int(found.inlier.sum())
         if count < self.config.incremental.min_tracks:
             return None, count
@@ -278,11 +287,16 @@ class IncrementalReconstructor:
     def _append(
         self, frame: int, timestamp: float, status: FrameStatus, static: LabelledFrame, pose: FramePose | None
     ) -> None:
+        seen = no_observations()
         if status is FrameStatus.TRACKED:
             assert pose is not None
             keyframe = int(self.window.frame[-1])
             relative = se3.inverse(self.window.pose[-1]) @ pose.world_T_cam
             covariance, log_scale = pose.covariance, pose.log_scale
+            if self.window.intrinsics_free and self.config.input.intrinsics == "free":
+                agreeing = _picked(static, pose.inlier)
+                number = np.full(len(agreeing.track), frame)
+                seen = Observations(agreeing.track, number, agreeing.uv, agreeing.depth, agreeing.weight)
         else:
             keyframe, relative, covariance = frame, np.eye(4), np.zeros((6, 6))
             log_scale = 0.0 if pose is None else pose.log_scale
@@ -291,7 +305,9 @@ class IncrementalReconstructor:
             bridged = 0 if pose is not None else self._bridged_frames() + 1
             self.window.append(frame, world_T_cam, log_scale, agreeing, bridged)
         none = DynamicPoints.none()
-        self.pending.append(PendingFrame(frame, timestamp, status, keyframe, relative, covariance, log_scale, none))
+        self.pending.append(
+            PendingFrame(frame, timestamp, status, keyframe, relative, covariance, log_scale, none, seen)
+        )
 
     def _rescale(self, log_scale: float) -> None:
         """Let what was found at the old scale of the world follow where added factors have changed it.
@@ -326,6 +342,29 @@ class IncrementalReconstructor:
             for pending in hanging:
                 if pending.keyframe == window.frame[row]:
                     pending.keyframe_T_cam = refocused(pending.keyframe_T_cam, ratio, np.exp(deeper))
+
+    def _pose_again(self, row: int) -> None:
+        """Pose the frames anew that hang on a keyframe and were posed before the focal lengths were known.
+
+        Until then they follow to first order (:func:`refocused`), which leaves their turns as they are.
+        """
+        window = self.window
+        for pending in self.pending:
+            if pending.keyframe != window.frame[row] or not len(pending.seen):
+                continue
+            known, points = window.landmarks_of(pending.seen.track)
+            seen = pending.seen.select(known)
+            if len(seen) < self.config.incremental.min_tracks:
+                continue
+            label = np.zeros(len(seen), dtype=np.int64)
+            tracks = LabelledFrame(seen.track, seen.uv, seen.depth, seen.weight, label, label[:0])
+            found = locate(
+                [window.pose[row] @ pending.keyframe_T_cam], tracks, points[known], window.intrinsics, window.noise,
+                self.config, self._run, window.cue_scale, window.point_errors(seen.track, points[known], row),
+            )  # fmt: skip
+            if found.inlier.sum() >= self.config.incremental.min_tracks:
+                pending.keyframe_T_cam = se3.inverse(window.pose[row]) @ found.world_T_cam
+                pending.covariance, pending.log_scale = found.covariance, found.log_scale
 
     def _bridged_frames(self) -> int:
         """Return how many of the newest frames were bridged."""

@@ -35,6 +35,7 @@ from uni4d_fg.optim.considered import Considered
 from uni4d_fg.optim.marginalization import marginalize_with_spread
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.slam.incremental.labels import LabelledFrame
+from uni4d_fg.slam.incremental.point_errors import PointErrors, point_errors
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.lifting import frame_log_scales, lift, mean_per_row
@@ -261,6 +262,10 @@ class CameraWindow:
         observations = self.observations.select(mine)
         points = lift(observations, self._cameras())
         return mean_per_row(points, observations.weight, order[at[mine]], len(track))
+
+    def point_errors(self, track: IntArray, points: FloatArray, row: int = -1) -> PointErrors:
+        """Return how uncertain the points (n, 3) of tracks (n,) are that a frame on a keyframe is posed by."""
+        return point_errors(self.observations, self._cameras(), row, track, points, self.noise)
 
     def log_depths(self, row: int) -> tuple[IntArray, FloatArray]:
         """Return the tracks (n,) of the landmarks that a keyframe sees, ascending, and their log-depths (n,)."""
