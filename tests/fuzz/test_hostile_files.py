@@ -403,6 +403,26 @@ def test_calibrations(tmp_path_factory: pytest.TempPathFactory, data: st.DataObj
         assert np.isfinite(found.lens.padded).all()
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fl_x": 10**400},
+        {"w": 10**400},
+        {"w": 1e400, "h": 1e400},
+        {"k1": 1e400},
+        {"cx": None},
+        {"fl_x": [1]},
+        {"h": -1},
+    ],
+)
+def test_a_calibration_that_is_wrong_is_one_clear_error(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({**CALIBRATIONS[".json"], **change}).replace("Infinity", "1e400"))
+    error = judged(load_calibration, path, 6, (60, 80))
+    assert isinstance(error, InputError)
+    assert "transforms.json" in str(error)
+
+
 UNIT = "0.1 0.2 0.3 0 0 0 1"
 MEASURED: dict[str, str] = {
     "odometry.tum": "".join(f"{t} {UNIT}\n" for t in range(6)),

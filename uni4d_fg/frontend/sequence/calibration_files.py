@@ -25,7 +25,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.yaml_text import parse_yaml
-from uni4d_fg.errors import ConfigError
+from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.frontend.sequence.calibration import load_intrinsics
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.resize import scale_intrinsics
@@ -77,13 +77,18 @@ def load_calibration(path: Path, num_frames: int, size: tuple[int, int]) -> Cali
     read = {".txt": _colmap, ".json": _nerfstudio}.get(suffix, _yaml)
     try:
         found = read(path)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+        numbers = np.concatenate([found.intrinsics, found.lens.padded])
+        if not np.isfinite(numbers).all() or (found.intrinsics[:2] <= 0).any():
+            raise SequenceProblem(
+                path, "has a focal length that is not positive, or a number that is not finite", "check it"
+            )
+        return _fitted(path, found, size)
+    except SequenceProblem:
+        raise
+    except InputError as error:  # of the lens
         raise SequenceProblem(path, f"has no complete calibration ({error})", "export it again") from error
-    if not np.isfinite(found.intrinsics).all() or (found.intrinsics[:2] <= 0).any():
-        raise SequenceProblem(
-            path, "has a focal length that is not positive, or a number that is not finite", "check it"
-        )
-    return _fitted(path, found, size)
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise SequenceProblem(path, f"has no complete calibration ({error})", "export it again") from error
 
 
 def _fitted(path: Path, found: Calibration, size: tuple[int, int]) -> Calibration:
