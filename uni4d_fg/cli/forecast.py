@@ -170,7 +170,7 @@ def expected_shares(
     add("nonrigid", 0.3, 0.12)
     if config.joint.enabled:
         add("joint", 0.5, 0.6)
-    add("fusion", 2.0, 1.5)
+    add("fusion", 1.0, 0.4)
     add("clouds and pictures", 3.0, 0.2)
     return shares
 
