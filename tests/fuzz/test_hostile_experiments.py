@@ -276,6 +276,14 @@ def test_lists_with_times_closer_than_any_camera_take_no_time(tmp_path: Path) ->
     assert len(read_file_list(folder / "rgb.txt").times) == len(read_pose_list(folder / "groundtruth.txt").times)
 
 
+def test_fewer_true_poses_than_images(datasets: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(datasets / "bonn", tmp_path / "bonn"))
+    path = next(root.rglob("groundtruth.txt"))
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-3]))
+    assert isinstance(judged(find_dataset("bonn").notes, root, "balloon2"), tuple)
+    assert "groundtruth.txt" in str(judged(find_dataset("bonn").open, root, "balloon2"))
+
+
 def test_times_that_are_no_numbers_are_refused(datasets: Path) -> None:
     folder = datasets / "sintel" / "training" / "final" / "alley_2"
     paths = tuple(sorted(folder.iterdir()))

@@ -438,6 +438,21 @@ MEASURED: dict[str, str] = {
 }
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"noise: '{'9' * 5000}'",
+        f"x: '{'9' * 5000}'",
+        "body_T_cam: [[1,1e300,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",
+        "time_offset: [1]",
+    ],
+)
+def test_an_imu_that_is_wrong_is_one_clear_error(tmp_path: Path, text: str) -> None:
+    (tmp_path / "imu.csv").write_text(MEASURED["imu.csv"])
+    (tmp_path / "imu.yaml").write_text(text)
+    assert isinstance(judged(read_imu, tmp_path), InputError)
+
+
 @hostile
 @given(data=st.data())
 def test_measurements(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:

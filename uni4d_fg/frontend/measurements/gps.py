@@ -127,7 +127,7 @@ def _read_columns(path: Path) -> tuple[dict[str, FloatArray], list[int]]:
     header = [name.strip().lower() for name in table[0][1]]
     names = _wanted(header)
     if names is None:
-        raise InputError(f"{path}, line {table[0][0]}: has the columns {', '.join(header)}; expected {expected}")
+        raise InputError(f"{path}, line {table[0][0]}: has the columns {', '.join(header)[:200]}; expected {expected}")
     if len(table) == 1:
         raise InputError(f"{path}: has a header and no position")
     rows = []

@@ -15,6 +15,7 @@ stands beside them in ``imu.yaml``:
 from __future__ import annotations
 
 import hashlib
+import reprlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -101,7 +102,7 @@ class ImuSamples:
         if (np.diff(self.timestamps) <= 0).any():
             row = int(np.argmax(np.diff(self.timestamps) <= 0))
             raise InputError(f"IMU: timestamps do not increase after sample {row}; sort the samples by time")
-        rotation = self.body_T_cam[:3, :3]
+        rotation = np.clip(self.body_T_cam[:3, :3], -2.0, 2.0)  # beyond, it is none, and must not overflow
         rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0
         if not rigid or np.abs(self.body_T_cam[3] - [0, 0, 0, 1]).max() > _MAX_ROTATION_ERROR:
             raise InputError("IMU: body_T_cam is no rigid transform (4 x 4, rotation and translation in meters)")
@@ -235,7 +236,7 @@ def _device(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: cannot be read ({error})") from error
     allowed = ("noise", "body_T_cam", "time_offset")
     if not isinstance(read, dict) or set(read) - set(allowed):
-        raise InputError(f"{file}: must be a mapping with some of {', '.join(allowed)}, got {read!r}")
+        raise InputError(f"{file}: must be a mapping with some of {', '.join(allowed)}, got {reprlib.repr(read)}")
     known: dict[str, Any] = {}
     if "noise" in read:
         known["noise"] = _noise(read["noise"], file)
@@ -259,5 +260,5 @@ def _noise(given: Any, file: Path) -> ImuNoise:
         except InputError as error:
             raise InputError(f"{file}: {error}") from error
     raise InputError(
-        f"{file}: noise is {given!r}; give one of {', '.join(NOISE_PRESETS)}, or all of {', '.join(names)}"
+        f"{file}: noise is {reprlib.repr(given)}; give one of {', '.join(NOISE_PRESETS)}, or all of {', '.join(names)}"
     )
