@@ -9,6 +9,21 @@
   if (window.uni4dDetail || !window.WebGL2RenderingContext) return;
   const TARGET_MS = 38, TOUCH_MS = 300, STILL_FACTOR = 6, STILL_MOST = 20, FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24;
   const state = (window.uni4dDetail = { budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false });
+  // Without a graphics card, smoothing of edges costs more than everything else; points have none.
+  let software = null;
+  const getContext = HTMLCanvasElement.prototype.getContext;
+  const rendererOf = (canvas) => {
+    const gl = getContext.call(canvas, "webgl2"), info = gl?.getExtension("WEBGL_debug_renderer_info");
+    const name = gl ? String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) : "";
+    gl?.getExtension("WEBGL_lose_context")?.loseContext();
+    return name;
+  };
+  HTMLCanvasElement.prototype.getContext = function (kind, options, ...rest) {
+    if (kind !== "webgl2" || !options?.antialias) return getContext.call(this, kind, options, ...rest);
+    software ??= /swiftshader|llvmpipe|software|basic render/i.test(rendererOf(document.createElement("canvas")));
+    return getContext.call(this, kind, { ...options, antialias: !software }, ...rest);
+  };
+
   const gl2 = WebGL2RenderingContext.prototype;
   const NAMES = ["scale", "modelViewMatrix", "projectionMatrix"];
   const located = new WeakMap(), values = new WeakMap();
