@@ -13,17 +13,17 @@
     document.body.addEventListener("click", (event) => {
       if (event.detail > 0 && event.target.type === "checkbox") event.target.blur();
     });
-    // On narrow screens viser shows its panel over the lower half of the picture, with no option to begin closed.
-    if (!window.matchMedia("(max-width: 36em)").matches) return;
-    const sheet = () => [...document.querySelectorAll("div")].find(
-      (div) => div.style.position === "fixed" && div.style.bottom === "0px" && div.style.maxHeight === "60%");
-    const watch = new MutationObserver(() => {
+    // On narrow screens viser shows its panel over the lower half of the picture, with no option to begin closed. How
+    // wide the screen is may not be known yet: where there is no such panel, nothing is found.
+    const sheet = () => [...document.querySelectorAll('div[style*="max-height: 60%"]')].find(
+      (div) => div.style.position === "fixed" && div.style.bottom === "0px");
+    // The panel is made anew when settings arrive, and then begins open again; a finger opens and closes the same one.
+    const closed = new WeakSet();
+    new MutationObserver(() => {
       const handle = sheet()?.querySelector('div[style*="cursor: pointer"]');
-      if (!handle) return;
-      watch.disconnect();
+      if (!handle || closed.has(handle)) return;
+      closed.add(handle);
       handle.click();
-    });
-    watch.observe(document.body, { childList: true, subtree: true });
-    setTimeout(() => watch.disconnect(), 20000);
+    }).observe(document.body, { childList: true, subtree: true });
   });
 })();
