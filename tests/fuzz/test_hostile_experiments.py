@@ -141,6 +141,16 @@ def test_outputs_of_other_programs(tmp_path_factory: pytest.TempPathFactory, dat
     judged(read_method, f"{layout}:theirs={folder}", OneVideo(), folder, ("v",), ("sim3",), ("metric", "uni4d-scale"))
 
 
+def test_depth_of_another_size_in_one_frame_costs_that_video_only(tmp_path: Path) -> None:
+    methods.WRITERS["uni4d"](tmp_path, sample_video())
+    path = sorted(tmp_path.rglob("*.npz"))[1]
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    np.savez(path, **{**arrays, "disp": arrays["disp"][:-1]})
+    found = judged(read_method, f"uni4d={tmp_path}", OneVideo(), tmp_path, ("v",), ("sim3",), ())
+    assert "maps of one size" in str(found.results["v"].failed)
+
+
 @hostile
 @given(data=st.data())
 def test_exr_files(data: st.DataObject) -> None:

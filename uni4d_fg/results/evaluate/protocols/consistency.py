@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
+from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
 from uni4d_fg.geometry.lens import PINHOLE, Lens
@@ -62,12 +63,20 @@ def score_consistency(
 
     Returns:
         The score; None if no pixel could be compared.
+
+    Raises:
+        InputError: If maps have different sizes.
     """
     errors = []
     for frame in range(len(depths) - distance):
         other = frame + distance
         depth, label = np.asarray(depths[frame], np.float64), masks[frame]
         seen, seen_label = np.asarray(depths[other], np.float64), masks[other]
+        if not depth.shape == seen.shape == label.shape == seen_label.shape:
+            raise InputError(
+                f"depth of frames {frame} and {other} has sizes {depth.shape} and {seen.shape}, masks {label.shape} and "
+                f"{seen_label.shape}; give maps of one size"
+            )
         height, width = depth.shape
         with np.errstate(invalid="ignore"):
             v, u = np.nonzero(np.isfinite(depth) & (depth > 0) & (label == 0))
