@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import uni4d_fg.factors.terms  # noqa: F401 - what the package declares stays when the test's own goes
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.factors import factor_type
 from uni4d_fg.frontend.sequence.write import write_native
