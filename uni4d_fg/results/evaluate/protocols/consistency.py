@@ -74,8 +74,8 @@ def score_consistency(
         seen, seen_label = np.asarray(depths[other], np.float64), masks[other]
         if not depth.shape == seen.shape == label.shape == seen_label.shape:
             raise InputError(
-                f"depth of frames {frame} and {other} has sizes {depth.shape} and {seen.shape}, masks {label.shape} and "
-                f"{seen_label.shape}; give maps of one size"
+                f"depth of frames {frame} and {other} has sizes {depth.shape} and {seen.shape}, masks "
+                f"{label.shape} and {seen_label.shape}; give maps of one size"
             )
         height, width = depth.shape
         with np.errstate(invalid="ignore"):
