@@ -109,5 +109,10 @@ class InputConfig(Section):
         "'auto' finds frames that repeat the one before, which a change of frame rate leaves, and gives them its pose; "
         "'keep' solves them as frames of their own.",
     )
+    repair_masks: bool = setting(
+        True,
+        "Make masks that are missing for a frame or two, between frames that have them, from those beside by optical "
+        "flow.",
+    )
     min_depth_m: float = setting(0.05, "Depth below this is treated as missing, m.", ge=0, basic=True)
     max_depth_m: float = setting(80.0, "Depth above this is treated as missing, m.", gt=0, basic=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +14,8 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
+from uni4d_fg.counted import counted
+from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warning
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
@@ -223,6 +225,8 @@ def _reconstruct(
     atomic_write_text(folder.config, dump_config(config))
     key = sequence_key(sequence, run.should_stop)
     sequence = run.sequence = without_bars(sequence, look=config.input.black_bars == "auto")
+    if config.input.repair_masks:
+        sequence = run.sequence = _with_repaired_masks(run)
     key, labelled = _labels(run, key)
     key = stage_key(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
@@ -352,6 +356,15 @@ def _searched(config: Config) -> list[RigidObjectsConfig]:
     return [config.rigid_objects] if config.rigid_objects.enabled else []
 
 
+def _with_repaired_masks(run: _Run) -> Sequence:
+    """Return the sequence with masks where some were missing.
+
+    They follow from images, masks and configuration, which are in the keys of all stages: a resumed run makes the same.
+    """
+    repaired = repair_masks(run.sequence.images, run.sequence.masks, run.sequence.image_size)
+    return run.sequence if repaired is None else replace(run.sequence, masks=repaired)
+
+
 def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
     """Track and label; the labelled tracks are stored in ``labels.npz``, their key beside the stages."""
     sequence, config = run.sequence, run.config
@@ -365,7 +378,12 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
         counts = labelled.counts()
         facts = [", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())]
         facts += bars_note(sequence.content, sequence.image_size)
-        return StageRecord({"num_tracks": np.array(tracks.num_tracks)}, {"tracks": counts, "facts": facts})
+        found: dict[str, Any] = {"tracks": counts, "facts": facts}
+        if isinstance(sequence.masks, RepairedMasks):
+            found["repaired_masks"] = sequence.masks.frames
+            found["warnings"] = [repair_warning(sequence.masks.frames)]
+            facts.append(f"masks of {counted(len(sequence.masks.frames), 'frame')} were made from those beside")
+        return StageRecord({"num_tracks": np.array(tracks.num_tracks)}, found)
 
     if run.resume and not _readable(lambda: load_labels(run.folder.labels)):
         run.store.discard("tracks")
