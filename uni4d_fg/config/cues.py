@@ -112,7 +112,7 @@ class InputConfig(Section):
     repair_masks: bool = setting(
         True,
         "Make masks that are missing for a frame or two, between frames that have them, from those beside by optical "
-        "flow.",
+        "flow, and average masks that grow and shrink from frame to frame.",
     )
     min_depth_m: float = setting(0.05, "Depth below this is treated as missing, m.", ge=0, basic=True)
     max_depth_m: float = setting(80.0, "Depth above this is treated as missing, m.", gt=0, basic=True)

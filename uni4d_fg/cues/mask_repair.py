@@ -8,19 +8,27 @@ masks from both sides agree. A video whose masks are missing often is left alone
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.counted import counted
-from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray, shrunk_size, warp_back, working_scale
+from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray, warp_back
+from uni4d_fg.cues.mask_distance import (
+    PackedDistance,
+    carried_distance,
+    instance_areas,
+    overlap,
+    shrunk_mask,
+    working_size,
+)
+from uni4d_fg.cues.mask_flicker import averaged_masks, may_flicker
 from uni4d_fg.frontend.sequence.frames import LazyFrames, where_of
 from uni4d_fg.frontend.sequence.model import FrameSource
 
-_LONGER_SIDE_PX = 320
 _SPECK = 0.05
 """A mask with less than this part of the area on both sides is missing."""
 _LONGEST = 2
@@ -39,8 +47,6 @@ _OVERLAP = 0.5
 """Intersection over union of the masks from both sides, at least."""
 _FREE = 0.5
 """Part of the carried mask without another instance, at least: the thing may have another number, or be hidden."""
-_BAND_PX = 12.0
-"""Distances beyond say nothing more, working px."""
 
 
 @dataclass(frozen=True)
@@ -54,23 +60,39 @@ class _Beside:
 
 
 class RepairedMasks(LazyFrames[Int32Array]):
-    """Label maps (H, W) with instances added to some frames; the others are those of the source.
+    """Label maps (H, W) with instances added to some frames, or drawn anew; the others are those of the source.
 
     Args:
         source: T label maps, 0 static.
-        distance: Of each repaired frame, the signed distance (h, w) to the border of each added instance, positive
-            inside, at working size.
+        made: Of each frame in which masks were missing, the instances that are added, by their distances.
+        averaged: Of each instance that flickers, its new distances by frame.
     """
 
     def __init__(
-        self, source: FrameSource[Int32Array], distance: dict[int, dict[int, npt.NDArray[np.float16]]]
-    ) -> None:
-        self.source, self.distance = source, distance
+        self, source: FrameSource[Int32Array], made: dict[int, dict[int, PackedDistance]],
+        averaged: dict[int, dict[int, PackedDistance]] | None = None,
+    ) -> None:  # fmt: skip
+        self.source, self.made, self.averaged = source, made, averaged or {}
 
     @property
     def frames(self) -> list[int]:
-        """Repaired frames, ascending."""
-        return sorted(self.distance)
+        """Frames in which masks were missing, ascending."""
+        return sorted(self.made)
+
+    @property
+    def instances(self) -> list[int]:
+        """Instances whose masks were averaged, ascending."""
+        return sorted(self.averaged)
+
+    def fingerprint(self) -> str:
+        """Return a hash of what differs from the source: optical flow may depend on the machine."""
+        digest = hashlib.blake2b(digest_size=16)
+        for changes in (self.made, self.averaged):
+            for one, distances in sorted(changes.items()):
+                for other, distance in sorted(distances.items()):
+                    digest.update(f"{one} {other} {distance.top} {distance.left} {distance.steps.shape}".encode())
+                    digest.update(distance.steps.tobytes())
+        return digest.hexdigest()
 
     def __len__(self) -> int:
         return len(self.source)
@@ -81,15 +103,18 @@ class RepairedMasks(LazyFrames[Int32Array]):
 
     def _read(self, frame: int) -> Int32Array:
         mask = self.source[frame]
-        added = self.distance.get(frame)
-        if added is None:
+        again = {label: at[frame] for label, at in self.averaged.items() if frame in at}
+        drawn = self.made.get(frame, {}) | again
+        if not drawn:
             return mask
         out = np.array(mask, np.int32)
+        for label in again:
+            out[out == label] = 0
+        free = out == 0  # never over what the frame's own mask says of others
         nearest = np.zeros(mask.shape, np.float32)
-        for label, distance in sorted(added.items()):
-            large = cv2.resize(distance.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            # Never over what the frame's own mask says.
-            inside = (large > nearest) & (mask == 0)
+        for label, distance in sorted(drawn.items()):
+            large = cv2.resize(distance.whole(), mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            inside = (large > nearest) & free
             out[inside] = label
             nearest = np.maximum(nearest, np.asarray(large))
         return out
@@ -98,9 +123,9 @@ class RepairedMasks(LazyFrames[Int32Array]):
 def repair_masks(
     images: FrameSource[ImageArray], masks: FrameSource[Int32Array], image_size: tuple[int, int]
 ) -> RepairedMasks | None:
-    """Make missing masks from those beside; None where none is missing.
+    """Make missing masks from those beside, and average those that flicker; None where nothing is wrong.
 
-    One frame is held at a time, of each instance its areas, and of each repair one small map.
+    A few frames are held at a time, of each instance its areas, and of each change one small map.
 
     Args:
         images: T images (H, W, 3), RGB.
@@ -110,30 +135,54 @@ def repair_masks(
     Raises:
         InputError: If a frame or mask cannot be read.
     """
-    size = shrunk_size(image_size, working_scale(image_size, _LONGER_SIDE_PX))
+    size = working_size(image_size)
+    areas = instance_areas(masks, size)
+    made = _made_masks(images, masks, areas, size)
+    whole = RepairedMasks(masks, made) if made else masks
+    suspects = sorted(label for label, area in areas.items() if may_flicker(area))
+    averaged = averaged_masks(images, whole, suspects, size) if suspects else {}
+    return RepairedMasks(masks, made, averaged) if made or averaged else None
+
+
+def _made_masks(
+    images: FrameSource[ImageArray], masks: FrameSource[Int32Array], areas: dict[int, FloatArray], size: tuple[int, int]
+) -> dict[int, dict[int, PackedDistance]]:
+    """Return by frame the instances whose masks are missing there, as they are carried over."""
     flow = DenseFlow()
-    distance: dict[int, dict[int, npt.NDArray[np.float16]]] = {}
-    for label, area in sorted(_areas(masks, size).items()):
+    made: dict[int, dict[int, PackedDistance]] = {}
+    for label, area in sorted(areas.items()):
         for first, last in missing_gaps(area):
             sides = [
-                _Beside(shrunk_gray(images[at], size), _shrunk(masks[at], size) == label)
+                _Beside(shrunk_gray(images[at], size), shrunk_mask(masks[at], size) == label)
                 for at in (first - 1, last + 1)
             ]
             for frame in range(first, last + 1):
-                gray, others = shrunk_gray(images[frame], size), _shrunk(masks[frame], size)
+                gray, others = shrunk_gray(images[frame], size), shrunk_mask(masks[frame], size)
                 found = _between(gray, (others != 0) & (others != label), sides, flow)
                 if found is not None:
-                    distance.setdefault(frame, {})[label] = found.astype(np.float16)
-    return RepairedMasks(masks, distance) if distance else None
+                    made.setdefault(frame, {})[label] = PackedDistance.of(found)
+    return made
 
 
-def repair_warning(frames: list[int]) -> str:
-    """Return what a summary says of repaired frames."""
-    listed = ", ".join(map(str, frames[:10])) + (", ..." if len(frames) > 10 else "")
-    return (
-        f"masks are missing in {counted(len(frames), 'frame')} between frames that have them, and were made from those "
-        f"beside (input.repair_masks): {listed}"
-    )
+def repair_warnings(repaired: RepairedMasks) -> list[str]:
+    """Return what a summary says of repaired masks."""
+    warnings, frames = [], repaired.frames
+    if frames:
+        warnings.append(
+            f"masks are missing in {counted(len(frames), 'frame')} between frames that have them, and were made from "
+            f"those beside (input.repair_masks): {_listed(frames)}"
+        )
+    if repaired.instances:
+        warnings.append(
+            "masks grow and shrink from frame to frame, and were averaged over the frames beside "
+            f"(input.repair_masks): {'instance' if len(repaired.instances) == 1 else 'instances'} "
+            f"{_listed(repaired.instances)}"
+        )
+    return warnings
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
 
 
 def missing_gaps(area: FloatArray) -> list[tuple[int, int]]:
@@ -164,41 +213,12 @@ def missing_gaps(area: FloatArray) -> list[tuple[int, int]]:
     return gaps if missing <= _MOST * (seen[-1] - seen[0] + 1) else []
 
 
-def signed_distance(mask: BoolArray) -> Float32Array:
-    """Return the distance (H, W) to the border of a mask, px, positive inside, bounded."""
-    if not mask.any():
-        return np.full(mask.shape, -_BAND_PX, np.float32)
-    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
-    outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
-    distance = np.asarray(inside - outside + np.where(mask, -0.5, 0.5), np.float32)
-    return np.clip(distance, -_BAND_PX, _BAND_PX)
-
-
-def _areas(masks: FrameSource[Int32Array], size: tuple[int, int]) -> dict[int, FloatArray]:
-    """Return the areas (T,) of each instance, px of working ``size``."""
-    areas: dict[int, FloatArray] = {}
-    for frame, mask in enumerate(masks):
-        labels, counts = np.unique(_shrunk(mask, size), return_counts=True)
-        for label, count in zip(labels.tolist(), counts.tolist(), strict=True):
-            if label:
-                areas.setdefault(label, np.zeros(len(masks)))[frame] = count
-    return areas
-
-
-def _shrunk(mask: Int32Array, size: tuple[int, int]) -> Int32Array:
-    """Return the nearest pixels of a label map (H, W) at working ``size``; OpenCV resizes no 64-bit integers."""
-    rows, columns = (
-        ((np.arange(n) + 0.5) * whole / n).astype(np.int64) for n, whole in zip(size, mask.shape, strict=True)
-    )
-    return mask[np.ix_(rows, columns)]
-
-
 def _between(gray: ImageArray, others: BoolArray, sides: list[_Beside], flow: DenseFlow) -> Float32Array | None:
     """Return the signed distance (h, w) of an instance carried into a frame from both sides; None if it is not seen."""
     carried = []
     for side in sides:
         there, back = flow.between(gray, side.gray), flow.between(side.gray, gray)
-        distance = warp_back(signed_distance(side.mask), there, -_BAND_PX)
+        distance = carried_distance(side.mask, there)
         inside = distance > 0
         area, usual = np.count_nonzero(inside), np.count_nonzero(side.mask)
         if not usual / _AREA_RATIO <= area <= usual * _AREA_RATIO:
@@ -212,7 +232,7 @@ def _between(gray: ImageArray, others: BoolArray, sides: list[_Beside], flow: De
             return None
         carried.append(distance)
     first, second = (distance > 0 for distance in carried)
-    if np.count_nonzero(first & second) < _OVERLAP * np.count_nonzero(first | second):
+    if overlap(first, second) < _OVERLAP:
         return None
     mean = np.asarray((carried[0] + carried[1]) / 2, np.float32)
     inside = mean > 0

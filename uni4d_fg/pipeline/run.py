@@ -15,7 +15,7 @@ from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.counted import counted
-from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warning
+from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
@@ -226,7 +226,8 @@ def _reconstruct(
     key = sequence_key(sequence, run.should_stop)
     sequence = run.sequence = without_bars(sequence, look=config.input.black_bars == "auto")
     if config.input.repair_masks:
-        sequence = run.sequence = _with_repaired_masks(run)
+        key = _repair_masks(run, key)
+        sequence = run.sequence
     key, labelled = _labels(run, key)
     key = stage_key(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
@@ -356,13 +357,13 @@ def _searched(config: Config) -> list[RigidObjectsConfig]:
     return [config.rigid_objects] if config.rigid_objects.enabled else []
 
 
-def _with_repaired_masks(run: _Run) -> Sequence:
-    """Return the sequence with masks where some were missing.
-
-    They follow from images, masks and configuration, which are in the keys of all stages: a resumed run makes the same.
-    """
+def _repair_masks(run: _Run, key: str) -> str:
+    """Give the sequence masks where some were missing, and return the key, with what was changed."""
     repaired = repair_masks(run.sequence.images, run.sequence.masks, run.sequence.image_size)
-    return run.sequence if repaired is None else replace(run.sequence, masks=repaired)
+    if repaired is None:
+        return key
+    run.sequence = replace(run.sequence, masks=repaired)
+    return stage_key(key, repaired.fingerprint())
 
 
 def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
@@ -380,9 +381,13 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
         facts += bars_note(sequence.content, sequence.image_size)
         found: dict[str, Any] = {"tracks": counts, "facts": facts}
         if isinstance(sequence.masks, RepairedMasks):
-            found["repaired_masks"] = sequence.masks.frames
-            found["warnings"] = [repair_warning(sequence.masks.frames)]
-            facts.append(f"masks of {counted(len(sequence.masks.frames), 'frame')} were made from those beside")
+            repaired = sequence.masks
+            found |= {"repaired_masks": repaired.frames, "averaged_masks": repaired.instances}
+            found["warnings"] = repair_warnings(repaired)
+            if repaired.frames:
+                facts.append(f"masks of {counted(len(repaired.frames), 'frame')} were made from those beside")
+            if repaired.instances:
+                facts.append(f"masks of {counted(len(repaired.instances), 'instance')} were averaged over frames")
         return StageRecord({"num_tracks": np.array(tracks.num_tracks)}, found)
 
     if run.resume and not _readable(lambda: load_labels(run.folder.labels)):

@@ -1,0 +1,103 @@
+"""Masks that grow and shrink are averaged to where the thing is; true changes and normal noise are left alone."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from uni4d_fg.cues.mask_distance import PackedDistance, overlap, signed_distance
+from uni4d_fg.cues.mask_flicker import may_flicker
+from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks
+from uni4d_fg.frontend.sequence.model import ArrayFrames
+
+FRAMES, HEIGHT, WIDTH, SIDE = 20, 120, 160, 48
+
+
+def clip(rng: np.random.Generator, sizes: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """A textured square that crosses a textured wall and has a size (of :data:`SIDE`) per frame, and its true masks."""
+    noise = cv2.GaussianBlur(rng.uniform(0, 255, (HEIGHT, 2 * WIDTH, 3)), (0, 0), 1.5)
+    noise = np.clip((noise - 127) * 4 + 127, 0, 255).astype(np.uint8)
+    images, masks = [], []
+    for frame, scale in enumerate(sizes):
+        side = round(scale * SIDE)
+        top, left = (HEIGHT - side) // 2, 45 + 2 * frame - side // 2
+        image, mask = noise[:, WIDTH:].copy(), np.zeros((HEIGHT, WIDTH), np.int32)
+        image[top : top + side, left : left + side] = cv2.resize(noise[:SIDE, :SIDE], (side, side))
+        mask[top : top + side, left : left + side] = 2
+        images.append(image)
+        masks.append(mask)
+    return np.stack(images), np.stack(masks)
+
+
+def flickering(truth: np.ndarray, px: int) -> np.ndarray:
+    """Masks that are too large by some pixels in one frame, and too small in the next."""
+    out = truth.copy()
+    for frame, mask in enumerate(truth):
+        change = cv2.dilate if frame % 2 else cv2.erode
+        out[frame] = 2 * change((mask == 2).astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), np.uint8))
+    return out
+
+
+def repaired(images: np.ndarray, masks: np.ndarray) -> RepairedMasks | None:
+    return repair_masks(ArrayFrames(images), ArrayFrames(masks), (HEIGHT, WIDTH))
+
+
+def test_flickering_masks_are_averaged_to_the_truth(rng: np.random.Generator) -> None:
+    images, truth = clip(rng, [1.0] * FRAMES)
+    given = flickering(truth, 4)
+    given[7] = 0
+    found = repaired(images, given)
+    assert found is not None
+    assert found.instances == [2]
+    assert found.frames == [7]
+    before = [overlap(given[frame] > 0, truth[frame] > 0) for frame in range(FRAMES)]
+    after = [overlap(found[frame] > 0, truth[frame] > 0) for frame in range(FRAMES)]
+    assert np.mean(before) < 0.72
+    assert np.mean(after) > 0.9
+    assert min(after[2:-2]) > 0.8
+
+
+def test_another_instance_keeps_its_pixels(rng: np.random.Generator) -> None:
+    images, truth = clip(rng, [1.0] * FRAMES)
+    given = flickering(truth, 4)
+    given[:, 80:110, 20:140][given[:, 80:110, 20:140] == 0] = 5
+    found = repaired(images, given)
+    assert found is not None
+    assert found.instances == [2]
+    for frame in range(FRAMES):
+        np.testing.assert_array_equal(found[frame] == 5, given[frame] == 5)
+
+
+def test_good_masks_stay_as_they_are(rng: np.random.Generator) -> None:
+    images, truth = clip(rng, [1.0] * FRAMES)
+    assert repaired(images, truth) is None
+    given = truth.copy()
+    for frame, kind in enumerate(rng.integers(0, 3, FRAMES)):  # the noise of a good segmenter
+        given[frame] = (truth, flickering(truth, 1), flickering(truth[::-1], 1)[::-1])[kind][frame]
+    assert not np.array_equal(given, truth)
+    assert repaired(images, given) is None
+
+
+@pytest.mark.parametrize("swing", [0.05, 0.07, 0.1])
+def test_a_thing_that_really_grows_and_shrinks_stays_as_it_is(rng: np.random.Generator, swing: float) -> None:
+    images, truth = clip(rng, [1 - swing, 1 + swing] * (FRAMES // 2))
+    area = np.count_nonzero(truth, axis=(1, 2)).astype(float)
+    assert may_flicker(area)  # flow has to tell
+    assert repaired(images, truth) is None
+
+
+def test_a_thing_that_comes_nearer_does_not_flicker() -> None:
+    assert not may_flicker(400.0 * 1.25 ** np.arange(12.0))
+    assert not may_flicker(np.zeros(12))
+    assert not may_flicker(np.array([900.0, 400.0]))
+
+
+def test_distances_are_packed_to_a_tenth_of_a_px() -> None:
+    mask = np.zeros((60, 80), bool)
+    mask[20:35, 0:30] = True
+    distance = signed_distance(mask)
+    packed = PackedDistance.of(distance)
+    np.testing.assert_allclose(packed.whole(), distance, atol=0.0501)
+    assert packed.steps.nbytes < mask.size / 2
+    assert (PackedDistance.of(signed_distance(np.zeros_like(mask))).whole() < 0).all()

@@ -1,0 +1,117 @@
+"""Masks that grow and shrink from frame to frame, averaged over the frames beside.
+
+A segmenter may put a border too far out in one frame and too far in in the next. The masks of the frames beside,
+carried over by dense optical flow, tell where it lies on average. Masks that agree with those of their neighbors but
+for their normal noise are not touched.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, Int32Array
+from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray
+from uni4d_fg.cues.mask_distance import PackedDistance, carried_distance, overlap, shrunk_mask, signed_distance
+from uni4d_fg.frontend.sequence.model import FrameSource
+
+_UNSTABLE_PX = 1.5
+"""Borders that are this far from those of the frames beside, median over the frames, flicker: working px. Masks of good
+segmenters, and true ones, stay below 1."""
+_NOT_FOLLOWED = 0.8
+"""Part of that which is left when flow carries the masks of the frames beside, at least: what is less, a thing that
+really grows and shrinks, is seen by flow too."""
+_LEAST_FRAMES = 8
+_LEAST_PX = 24
+"""Area of a mask, working px."""
+_REACH = 2
+"""Frames before and after that are averaged."""
+_OVERLAP = 0.4
+"""Intersection over union of a mask with one that is carried over: where it is less, flow has failed."""
+
+
+def may_flicker(area: FloatArray) -> bool:
+    """Tell from the areas (T,) of an instance, working px, whether it is worth a look with optical flow."""
+    sides = [area[1:-1], area[:-2], area[2:]]
+    kept = np.min(sides, axis=0) >= _LEAST_PX if len(area) > 2 else np.zeros(0, bool)
+    if np.count_nonzero(kept) < _LEAST_FRAMES:
+        return False
+    own, before, after = (part[kept] for part in sides)
+    # A border is at least as long as that of a disk, so that this is an upper bound of its way.
+    return float(np.median(np.abs(own - (before + after) / 2) / np.sqrt(4 * np.pi * own))) > _UNSTABLE_PX
+
+
+def averaged_masks(
+    images: FrameSource[ImageArray], masks: FrameSource[Int32Array], labels: list[int], size: tuple[int, int]
+) -> dict[int, dict[int, PackedDistance]]:
+    """Return what is averaged of those of some instances that flicker.
+
+    Args:
+        images: T images (H, W, 3), RGB.
+        masks: T label maps (H, W).
+        labels: Instances to look at.
+        size: Working size.
+
+    Returns:
+        By instance and frame the averaged signed distance (h, w) to its border; nothing for instances that do not
+        flicker.
+
+    Raises:
+        InputError: If a frame or mask cannot be read.
+    """
+    flow, recent = DenseFlow(), _Recent(images, masks, size)
+    averages: dict[int, dict[int, PackedDistance]] = {label: {} for label in labels}
+    ways: dict[int, list[tuple[float, float]]] = {label: [] for label in labels}
+    for frame in range(len(masks)):
+        gray, mask = recent.at(frame)
+        present = [label for label in labels if np.count_nonzero(mask == label) >= _LEAST_PX]
+        if not present:
+            continue
+        beside = [other for other in range(frame - _REACH, frame + _REACH + 1) if 0 <= other < len(masks)]
+        flows = {other: flow.between(gray, recent.at(other)[0]) for other in beside if other != frame}
+        for label in present:
+            own: BoolArray = mask == label
+            distance = signed_distance(own)
+            carried = {}
+            for other, shift in flows.items():
+                there = recent.at(other)[1] == label
+                if np.count_nonzero(there) >= _LEAST_PX:
+                    moved = carried_distance(there, shift)
+                    if overlap(own, moved > 0) >= _OVERLAP:
+                        carried[other] = moved
+            if frame - 1 in carried and frame + 1 in carried:
+                border = max(1.0, np.count_nonzero(np.abs(distance) < 1.0) / 2)
+                usual = [
+                    sum(np.count_nonzero(part) for part in parts) / 2
+                    for parts in zip(
+                        *((recent.at(other)[1] == label, carried[other] > 0) for other in (frame - 1, frame + 1)),
+                        strict=True,
+                    )
+                ]
+                as_given, by_flow = (abs(np.count_nonzero(own) - area) / border for area in usual)
+                ways[label].append((as_given, by_flow))
+            mean = np.mean([distance, *carried.values()], axis=0)
+            averages[label][frame] = PackedDistance.of(np.asarray(mean, np.float32))
+    return {label: averages[label] for label, way in ways.items() if _flickers(way)}
+
+
+def _flickers(ways: list[tuple[float, float]]) -> bool:
+    """Tell from how far the border is from those beside, as they are and by flow, per frame, whether it flickers."""
+    if len(ways) < _LEAST_FRAMES:
+        return False
+    as_given, by_flow = np.median(ways, axis=0)
+    return bool(by_flow > _UNSTABLE_PX and by_flow >= _NOT_FOLLOWED * as_given)
+
+
+class _Recent:
+    """Gray images and masks of the last few frames, at working size."""
+
+    def __init__(self, images: FrameSource[ImageArray], masks: FrameSource[Int32Array], size: tuple[int, int]) -> None:
+        self.images, self.masks, self.size = images, masks, size
+        self.kept: dict[int, tuple[ImageArray, Int32Array]] = {}
+
+    def at(self, frame: int) -> tuple[ImageArray, Int32Array]:
+        """Return gray (h, w) and label map (h, w) of a frame."""
+        if frame not in self.kept:
+            self.kept = {number: pair for number, pair in self.kept.items() if number >= frame - 2 * _REACH}
+            self.kept[frame] = shrunk_gray(self.images[frame], self.size), shrunk_mask(self.masks[frame], self.size)
+        return self.kept[frame]
