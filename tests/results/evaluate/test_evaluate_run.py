@@ -249,3 +249,34 @@ def test_rigid_objects_are_scored_in_the_frames_that_see_them(
     text = format_report(report)
     assert "instance 7, rotation RMS / max" in text
     assert "instance 8" in text
+
+
+def test_depth_is_compared_with_itself_without_any_truth(
+    truth_and_run: tuple[Sequence, Reconstruction, Path],
+) -> None:
+    sequence, reconstruction, root = truth_and_run
+    flicker = np.array([0.0, 0.2, -0.1, 0.3, 0.0, 0.1])
+    wall = np.full((FRAMES, *SIZE), 2.0, np.float32)
+    sequence = dataclasses.replace(
+        sequence,
+        depths=ArrayFrames(wall * np.exp(-flicker)[:, None, None].astype(np.float32)),
+        ground_truth=GroundTruth(),
+    )
+    at_rest = dataclasses.replace(
+        reconstruction, world_T_cam=np.tile(np.eye(4), (FRAMES, 1, 1)), depth_log_scale=flicker
+    )
+    folder = RunFolder(root)
+    save_reconstruction(folder.reconstruction, at_rest)
+    with write_depth(folder.depth, FRAMES, SIZE) as writer:
+        for frame in range(FRAMES):
+            writer.write(frame, wall[frame] * (1.02 if frame == FRAMES - 1 else 1.0))
+    report = evaluate_run(root, sequence)
+    assert report.self_consistency is not None
+    fused, cue = report.self_consistency["fused"], report.self_consistency["cue"]
+    # Half of each frame is static; of the five pairs, the last differs by 2 %.
+    assert fused.pixels == cue.pixels == (FRAMES - 1) * SIZE[0] * SIZE[1] // 2
+    assert fused.mean == pytest.approx((1.0 - 1.0 / 1.02) / (FRAMES - 1), rel=1e-4)
+    assert (fused.below_1, fused.below_5) == (0.8, 1.0)
+    assert cue.mean == pytest.approx(0.0, abs=1e-6)
+    lines = format_report(report).split("Depth against itself\n")[1].splitlines()
+    assert lines[2].split() == ["fused", "0.0039", "80.00", "%", "100.00", "%"]

@@ -17,6 +17,7 @@ from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.evaluate.consistency import ConsistencyMetrics, evaluate_consistency
 from uni4d_fg.results.evaluate.depth import DepthReport, evaluate_depth
 from uni4d_fg.results.evaluate.points import PointMetrics, evaluate_points
+from uni4d_fg.results.evaluate.protocols.consistency import ConsistencyScore, score_consistency
 from uni4d_fg.results.evaluate.rigid_objects import ObjectReport, evaluate_objects
 from uni4d_fg.results.evaluate.trajectory import TrajectoryMetrics, evaluate_trajectory
 from uni4d_fg.results.io import load_reconstruction
@@ -46,6 +47,9 @@ class EvaluationReport:
     """Of the run's fused depth."""
     depth_cue: DepthReport | None
     """Of the depth the run started from, for comparison."""
+    self_consistency: dict[str, ConsistencyScore] | None
+    """Of the ``fused`` depth, and of the ``cue`` with the scale that each frame's was given; no truth is needed.
+    None, without a reason, where no static pixel is seen in two frames that follow each other."""
     landmarks: tuple[PointMetrics, ...] | None
     """One entry per alignment."""
     dynamic_points: tuple[PointMetrics, ...] | None
@@ -62,6 +66,8 @@ class EvaluationReport:
             "consistency": self.consistency and [metrics.to_dict() for metrics in self.consistency],
             "depth": self.depth and self.depth.to_dict(),
             "depth_cue": self.depth_cue and self.depth_cue.to_dict(),
+            "self_consistency": self.self_consistency
+            and {name: score.to_dict() for name, score in self.self_consistency.items()},
             "landmarks": self.landmarks and [metrics.to_dict() for metrics in self.landmarks],
             "dynamic_points": self.dynamic_points and [metrics.to_dict() for metrics in self.dynamic_points],
             "rigid_objects": self.rigid_objects and self.rigid_objects.to_dict(),
@@ -112,6 +118,7 @@ def evaluate_run(run_dir: Path, sequence: Sequence, *, max_depth_m: float = 70.0
         consistency=part("consistency", lambda: _consistency(reconstruction, sequence)),
         depth=part("depth", lambda: _depth(folder, sequence, max_depth_m)),
         depth_cue=part("depth_cue", lambda: _depth(None, sequence, max_depth_m)),
+        self_consistency=_self_consistency(reconstruction, sequence, folder),
         landmarks=part("landmarks", lambda: _landmarks(reconstruction, sequence, folder)),
         dynamic_points=part("dynamic_points", lambda: _dynamic(reconstruction, sequence, folder)),
         rigid_objects=part("rigid_objects", lambda: _objects(reconstruction, sequence)),
@@ -165,6 +172,22 @@ def _depth(folder: RunFolder | None, sequence: Sequence, max_depth_m: float) -> 
         raise _Unavailable(f"the run has no {folder.depth.name}")
     prediction = sequence.depths if folder is None else read_depth(folder.depth)
     return evaluate_depth(prediction, truth, sequence.masks, max_depth_m=max_depth_m)
+
+
+def _self_consistency(
+    reconstruction: Reconstruction, sequence: Sequence, folder: RunFolder
+) -> dict[str, ConsistencyScore] | None:
+    sources = [("cue", sequence.depths, reconstruction.depth_log_scale)]
+    if folder.depth.exists():
+        sources.insert(0, ("fused", read_depth(folder.depth), np.zeros(reconstruction.num_frames)))
+    found = {
+        name: score_consistency(
+            depths, sequence.masks, reconstruction.world_T_cam, reconstruction.frame_intrinsics,
+            lens=reconstruction.lens, log_scale=log_scale,
+        )
+        for name, depths, log_scale in sources
+    }  # fmt: skip
+    return {name: score for name, score in found.items() if score is not None} or None
 
 
 def _true_tracks(sequence: Sequence, folder: RunFolder, used: Int32Array) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from uni4d_fg.results.evaluate.consistency import ConsistencyMetrics
 from uni4d_fg.results.evaluate.depth import DepthReport
 from uni4d_fg.results.evaluate.points import PointMetrics
+from uni4d_fg.results.evaluate.protocols.consistency import ConsistencyScore
 from uni4d_fg.results.evaluate.rigid_objects import ObjectReport
 from uni4d_fg.results.evaluate.run import EvaluationReport
 from uni4d_fg.results.evaluate.trajectory import TrajectoryMetrics
@@ -22,6 +23,8 @@ def format_report(report: EvaluationReport) -> str:
         lines += _section("Covariances of the cameras", report, "consistency", _consistency_lines(report.consistency))
     lines += _section("Depth, fused", report, "depth", _depth_lines(report.depth))
     lines += _section("Depth, cue", report, "depth_cue", _depth_lines(report.depth_cue))
+    if report.self_consistency is not None:
+        lines += ["", "Depth against itself", *_self_consistency_lines(report.self_consistency)]
     lines += _section("Landmarks", report, "landmarks", _point_lines(report.landmarks))
     lines += _section("Dynamic points", report, "dynamic_points", _point_lines(report.dynamic_points))
     if report.rigid_objects is not None or "rigid_objects" in report.missing:
@@ -94,6 +97,14 @@ def _depth_lines(report: DepthReport | None) -> list[str]:
     lines.append("  [scale flicker: log median(prediction / truth) of static pixels per frame]")
     lines.append(_row("standard deviation", _number(flicker.standard_deviation, "")))
     lines.append(_row("frame-to-frame", _number(flicker.frame_to_frame, "")))
+    return lines
+
+
+def _self_consistency_lines(scores: dict[str, ConsistencyScore]) -> list[str]:
+    lines = [f"  [{next(iter(scores.values())).protocol}]", f"  {'':<16}{'SC':>10}{'< 0.01':>10}{'< 0.05':>10}"]
+    for name, score in scores.items():
+        shares = "".join(f"{100 * share:>8.2f} %" for share in (score.below_1, score.below_5))
+        lines.append(f"  {name:<16}{score.mean:>10.4f}{shares}")
     return lines
 
 

@@ -11,6 +11,7 @@ from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.results.evaluate.consistency import ConsistencyMetrics
 from uni4d_fg.results.evaluate.depth import DepthReport
 from uni4d_fg.results.evaluate.points import PointMetrics
+from uni4d_fg.results.evaluate.protocols.consistency import ConsistencyScore
 from uni4d_fg.results.evaluate.rigid_objects import ObjectReport
 from uni4d_fg.results.evaluate.run import EvaluationReport, evaluate_run
 from uni4d_fg.results.evaluate.trajectory import TrajectoryMetrics
@@ -46,6 +47,7 @@ def accuracy(report: EvaluationReport | str) -> Markup:
         *_consistency(report.consistency),
         *_depth("Depth, fused", report.depth),
         *_depth("Depth, cue", report.depth_cue),
+        *_self_consistency(report.self_consistency),
         *_points("Landmarks", report.landmarks),
         *_points("Moving points", report.dynamic_points),
         *_objects(report.rigid_objects),
@@ -108,6 +110,17 @@ def _depth(title: str, report: DepthReport | None) -> list[Markup]:
         f"frame to frame {number(flicker.frame_to_frame)}."
     )
     return [*out, element("p", text)]
+
+
+def _self_consistency(scores: dict[str, ConsistencyScore] | None) -> list[Markup]:
+    if not scores:
+        return []
+    rows = [
+        [name, number(score.mean), f"{100 * score.below_1:.2f} %", f"{100 * score.below_5:.2f} %"]
+        for name, score in scores.items()
+    ]
+    protocol = next(iter(scores.values())).protocol
+    return [element("h3", "Depth against itself"), table(protocol, ("depth", "SC", "δ < 0.01", "δ < 0.05"), rows)]
 
 
 def _points(title: str, results: Iterable[PointMetrics] | None) -> list[Markup]:

@@ -45,6 +45,7 @@ def score_consistency(
     distance: int = 1,
     occlusion: float = 0.25,
     lens: Lens = PINHOLE,
+    log_scale: FloatArray | None = None,
 ) -> ConsistencyScore | None:
     """Score depth against itself.
 
@@ -56,10 +57,11 @@ def score_consistency(
         depths: T maps (H, W), meters or any unit.
         masks: T label maps (H, W), 0 static.
         world_T_cam: (T, 4, 4) of the same world.
-        intrinsics: (4,) px of images of H x W.
+        intrinsics: (4,), or (T, 4) where the camera zooms, px of images of H x W.
         distance: Between the two frames.
         occlusion: Relative difference above which a point is taken to be hidden.
         lens: Distortion of the camera.
+        log_scale: (T,) logarithm of a factor on each frame's depth.
 
     Returns:
         The score; None if no pixel could be compared.
@@ -68,10 +70,12 @@ def score_consistency(
         InputError: If maps have different sizes.
     """
     errors = []
+    factor = np.ones(len(depths)) if log_scale is None else np.exp(log_scale)
+    cameras = np.broadcast_to(intrinsics, (len(depths), 4))
     for frame in range(len(depths) - distance):
         other = frame + distance
-        depth, label = np.asarray(depths[frame], np.float64), masks[frame]
-        seen, seen_label = np.asarray(depths[other], np.float64), masks[other]
+        depth, label = factor[frame] * np.asarray(depths[frame], np.float64), masks[frame]
+        seen, seen_label = factor[other] * np.asarray(depths[other], np.float64), masks[other]
         if not depth.shape == seen.shape == label.shape == seen_label.shape:
             raise InputError(
                 f"depth of frames {frame} and {other} has sizes {depth.shape} and {seen.shape}, masks "
@@ -82,14 +86,14 @@ def score_consistency(
             v, u = np.nonzero(np.isfinite(depth) & (depth > 0) & (label == 0))
         if not len(u):
             continue
-        ideal = lens.ideal_pixels(intrinsics, np.stack((u, v), axis=1).astype(np.float64))
-        points = camera_to_world(world_T_cam[frame], unproject(intrinsics, ideal, depth[v, u]))
+        ideal = lens.ideal_pixels(cameras[frame], np.stack((u, v), axis=1).astype(np.float64))
+        points = camera_to_world(world_T_cam[frame], unproject(cameras[frame], ideal, depth[v, u]))
         there = world_to_camera(world_T_cam[other], points)
         front = there[:, 2] > 1e-6
         there = there[front]
-        uv = project(intrinsics, there)
+        uv = project(cameras[other], there)
         if lens != PINHOLE:
-            uv = lens.real_pixels(intrinsics, uv)
+            uv = lens.real_pixels(cameras[other], uv)
         inside = np.isfinite(uv).all(axis=1) & (np.abs(uv) < 1e9).all(axis=1)
         pixel, z = np.rint(uv[inside]).astype(np.int64), there[inside, 2]
         inside = (pixel[:, 0] >= 0) & (pixel[:, 0] < width) & (pixel[:, 1] >= 0) & (pixel[:, 1] < height)
