@@ -42,8 +42,13 @@ _CARRIED_REACH, _CARRIED_FROM = 6, 2
 _BESIDE = tuple(range(1, _CARRIED_REACH + 1))
 _AVERAGED_SIGMA = (0.005, 0.06)
 """Bounds of the standard deviation from which it is told which frames agree."""
-_SHARP_PX = 2.0
-"""The cue has the detail of edges if it bleeds no farther, working px."""
+_SHARP_PX = 4.0
+"""Matching blurs edges by this itself: a cue that is found to bleed no farther has the detail of edges, working px."""
+_CLEARLY_BETTER = 0.8
+"""Matched depth is used if its error at landmarks is this part of the corrected cue's: views that frames share make
+it err alike in all of them, where errors of the cue average out ..."""
+_NOT_WORSE = 1.5
+"""... and if the cue bleeds, in any case but this one: landmarks do not lie on edges."""
 _SURE = 0.8
 """Matched depth of this confidence tells how far the cue bleeds."""
 _STILL = 0.6
@@ -108,7 +113,7 @@ def fuse_depth(
     if not unmatched and not maps.gains_by_matching():
         unmatched = "adds nothing to this cue, as landmarks say"
     # Anew, as the frames that were tried are not in order.
-    maps = replace(maps, unmatched=unmatched, matched=0, made={}, bled=[], errors={})
+    maps = replace(maps, unmatched=unmatched, bleeding_px=maps.bleeding_px or 0.0, matched=0, made={}, errors={})
     with write_depth(path, sequence.num_frames, sequence.image_size) as writer:
         threads = thread_count()
         for first in range(0, sequence.num_frames, threads):
@@ -144,10 +149,12 @@ class DenseMaps:
     multiview: MultiviewDepth = field(init=False)
     matched: int = 0
     """Frames with depth from several views."""
-    bleeding_px: float = 0.0
-    """How far the cue bleeds across edges, working px."""
+    bleeding_px: float | None = None
+    """How far the cue bleeds across edges, working px; None as long as it is measured."""
     bled: list[float] = field(default_factory=list)
-    """The same of single frames."""
+    """The same of single frames ..."""
+    tried: list[float] = field(default_factory=list)
+    """... and the error of matched depth at landmarks over that of the cue."""
     errors: dict[int, float] = field(default_factory=dict)
     """Frames that are done, to the mean error to expect of their static depth."""
     made: dict[int, tuple[StaticDepth, Float32Array]] = field(default_factory=dict)
@@ -166,8 +173,14 @@ class DenseMaps:
         sound = [frame for frame in range(self.sequence.num_frames) if frame not in self.broken]
         for at in evenly_spread(len(sound), _TRIED_FRAMES).tolist():
             self._static(sound[at])
-        self.bleeding_px = float(np.median(self.bled)) if self.bled else 0.0
-        return self.matched > 0 or bool(self.broken)
+        bled = float(np.median(self.bled)) if self.bled else 0.0
+        self.bleeding_px = bled if bled > _SHARP_PX else 0.0
+        limit = self._limit()
+        return any(error < limit for error in self.tried) or bool(self.broken)
+
+    def _limit(self) -> float:
+        """Return the error of matched depth at landmarks, over that of the cue, below which it is used."""
+        return _NOT_WORSE if self.bleeding_px is None or self.bleeding_px > 0 else _CLEARLY_BETTER
 
     def _given(self, frame: int) -> Float32Array:
         """Return the cue (H, W), m, NaN where it is not a depth."""
@@ -230,7 +243,7 @@ class DenseMaps:
         mask, mine = self.sequence.masks[frame], self.control[frame]
         corrected, raw = self._static(frame)[0].corrected, self._given(frame)
         log_depth = affine_log_depth(raw, corrected.scale, corrected.shift) + self.size.enlarge(corrected.field)
-        radius = self.bleeding_px / self.size.scale[0]
+        radius = (self.bleeding_px or 0.0) / self.size.scale[0]
         for label in np.unique(mask[mask > 0]).tolist():
             pixels = mask == label
             if frame in self.broken:
@@ -260,7 +273,7 @@ class DenseMaps:
     def _lifted(self, frame: int, log_depth: Float32Array, cue: Float32Array) -> Float32Array:
         """Bring static depth to the size of the image: at edges by correcting the cue, which has the detail."""
         raw = self._given(frame)
-        if frame in self.broken or self.bleeding_px > _SHARP_PX:
+        if frame in self.broken or self.bleeding_px:
             guided = np.exp(upsample_guided(log_depth, self.sequence.images[frame]))
             return np.where(np.isfinite(raw), guided, np.float32(np.nan))
         with np.errstate(invalid="ignore"):
@@ -304,12 +317,14 @@ class DenseMaps:
             static, log_scale = np.isfinite(shown.matched), float(self.scene["log_scale"][frame])
             # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
             errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config)
-            if not errors.prefer_matching:
+            if self.bleeding_px is None:
+                self.tried.append(errors.matching)
+            if not errors.matching < self._limit():
                 measured = None
             self.matched += measured is not None
             known = known_depth(measured, uv, log_z, static, cue.shape)
             fused = fuse_static(cue, measured, known, errors.cue, log_scale, self.config)
-            if measured is not None and not broken:
+            if measured is not None and self.bleeding_px is None:
                 affine = affine_log_depth(cue, fused.corrected.scale, fused.corrected.shift)
                 bled = bleeding_radius(affine, np.log(measured.depth), static & (measured.confidence > _SURE))
                 self.bled += [bled] if np.isfinite(bled) else []

@@ -92,7 +92,8 @@ def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(
     for error, better in ((0.005, True), (0.1, False)):
         seen = np.exp(truth + error * rng.standard_normal(truth.shape)).astype(np.float32)
         measured = Measured(seen, np.full(depth.shape, 0.95, np.float32), sigma)
-        assert held_out_errors(noisy, measured, uv, log_z, static, 0.0, FusionConfig()).prefer_matching is better
+        ratio = held_out_errors(noisy, measured, uv, log_z, static, 0.0, FusionConfig()).matching
+        assert (ratio < 0.8) is better, ratio
     found = held_out_errors(noisy, None, uv, log_z, static, 0.0, FusionConfig())
     known = known_depth(None, uv, log_z, static, (HEIGHT, WIDTH))
     fused = fuse_static(noisy, None, known, found.cue, 0.0, FusionConfig())

@@ -24,10 +24,9 @@ _WRONG_ERROR = 0.15
 _RIGHT = 0.03
 _MEAN_TO_SIGMA = 1.2533
 """Standard deviation over mean absolute error, of a normal distribution."""
-_SHARED_ERROR = 1.5
-"""Landmarks beside each other err alike, so that a cue fitted to some predicts others better than its error is."""
 _FITTED_ERROR = 1.2
 """Its error over that at landmarks beside those that it was fitted to, on scenes with truth."""
+_LEAST_ERROR = 1e-5
 _TRACKED_PX = 5
 """Half a tracking window, working px."""
 _MIN_COMPARED = 20
@@ -193,8 +192,8 @@ class HeldOut(NamedTuple):
 
     cue: float
     """Of the cue that the other landmarks have corrected, everywhere; of the true error, as far as it is known."""
-    prefer_matching: bool
-    """Whether matched depth predicts them better than that cue, where it is sure."""
+    matching: float
+    """Of matched depth where it is sure, over that of the cue there; NaN without any."""
 
 
 def held_out_errors(
@@ -232,11 +231,11 @@ def held_out_errors(
     compared = (judges.weight > 0) & np.isfinite(corrected)
     of_cue = _FITTED_ERROR * mean_error(corrected, compared)
     if measured is None:
-        return HeldOut(of_cue, False)
+        return HeldOut(of_cue, float("nan"))
     # Tracking windows reach across edges: landmarks beside them bleed as a cue does.
     beside = cv2.dilate(_beside_edges(measured).astype(np.uint8), np.ones((2 * _TRACKED_PX + 1,) * 2, np.uint8)) > 0
     sure = compared & ~beside & (measured.confidence > _SURE)
-    return HeldOut(of_cue, mean_error(np.log(measured.depth), sure) < _SHARED_ERROR * mean_error(corrected, sure))
+    return HeldOut(of_cue, mean_error(np.log(measured.depth), sure) / max(mean_error(corrected, sure), _LEAST_ERROR))
 
 
 def _beside_edges(measured: Measured) -> BoolArray:
