@@ -38,7 +38,7 @@ def test_a_synthetic_scene_is_reconstructed_with_its_imu(cli: Run, scene: Path, 
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--imu", "nowhere"], 3, "nowhere: cannot be read"),
+        (["--imu", "nowhere"], 3, "nowhere: no such file"),
         (["--imu", "SCENE", "--solver", "adam"], 2, "do not go with solver: adam"),
         (["--imu", "SCENE", "--window", "8", "--overlap", "2"], 2, "do not go with windows"),
         (["--imu", "LATE"], 3, "do not cover the frames"),
