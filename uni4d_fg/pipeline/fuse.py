@@ -33,7 +33,7 @@ from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize, working_frame
-from uni4d_fg.results.fusion.static_depth import StaticDepth, fuse_static, held_out_errors, known_depth
+from uni4d_fg.results.fusion.static_depth import StaticDepth, fuse_static, held_out_errors, known_depth, without_edges
 from uni4d_fg.results.fusion.upsampling import upsample_guided
 from uni4d_fg.slam.reconstruction import zoomed
 
@@ -44,11 +44,10 @@ _AVERAGED_SIGMA = (0.005, 0.06)
 """Bounds of the standard deviation from which it is told which frames agree."""
 _SHARP_PX = 4.0
 """Matching blurs edges by this itself: a cue that is found to bleed no farther has the detail of edges, working px."""
-_CLEARLY_BETTER = 0.8
-"""Matched depth is used if its error at landmarks is this part of the corrected cue's: views that frames share make
-it err alike in all of them, where errors of the cue average out ..."""
+_BETTER = 1.0
+"""Matched depth is used if its error at landmarks is below this part of the corrected cue's ..."""
 _NOT_WORSE = 1.5
-"""... and if the cue bleeds, in any case but this one: landmarks do not lie on edges."""
+"""... and below this one if the cue bleeds: landmarks do not lie on edges."""
 _SURE = 0.8
 """Matched depth of this confidence tells how far the cue bleeds."""
 _STILL = 0.6
@@ -180,7 +179,7 @@ class DenseMaps:
 
     def _limit(self) -> float:
         """Return the error of matched depth at landmarks, over that of the cue, below which it is used."""
-        return _NOT_WORSE if self.bleeding_px is None or self.bleeding_px > 0 else _CLEARLY_BETTER
+        return _NOT_WORSE if self.bleeding_px is None or self.bleeding_px > 0 else _BETTER
 
     def _given(self, frame: int) -> Float32Array:
         """Return the cue (H, W), m, NaN where it is not a depth."""
@@ -322,6 +321,8 @@ class DenseMaps:
             if not errors.matching < self._limit():
                 measured = None
             self.matched += measured is not None
+            if measured is not None and self.bleeding_px == 0:
+                measured = without_edges(measured, cue)
             known = known_depth(measured, uv, log_z, static, cue.shape)
             fused = fuse_static(cue, measured, known, errors.cue, log_scale, self.config)
             if measured is not None and self.bleeding_px is None:

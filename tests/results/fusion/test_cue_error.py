@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from uni4d_fg.config.stages import FusionConfig
@@ -9,7 +10,7 @@ from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.cue_error import KnownDepth, correct_cue, fit_affine
 from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.results.fusion.multiview.measured import Measured
-from uni4d_fg.results.fusion.static_depth import fuse_static, held_out_errors, known_depth
+from uni4d_fg.results.fusion.static_depth import fuse_static, held_out_errors, known_depth, without_edges
 
 HEIGHT, WIDTH = 60, 80
 
@@ -120,3 +121,26 @@ def test_matched_depth_that_is_sure_wins_over_a_cue_that_is_wrong_and_says_so(rn
     assert chosen.mean() > 0.5
     assert (error[chosen] < 0.03).mean() > 0.95
     assert not chosen[:, :5].any() or error[:, :5][chosen[:, :5]].mean() < 0.03
+
+
+def test_matched_depth_leaves_the_edges_to_a_cue_that_has_them(rng: np.random.Generator) -> None:
+    """A step from 2 to 3 m: the cue has it where it is, with an error beside; matching has blurred it."""
+    depth = np.where(np.arange(WIDTH) < 40, 2.0, 3.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
+    cue = (depth * np.exp(0.01 * rng.standard_normal(depth.shape))).astype(np.float32)
+    blurred = cv2.GaussianBlur(depth, (0, 0), 2.0)
+    measured = Measured(blurred, np.full(depth.shape, 0.97, np.float32), np.full(depth.shape, 0.003, np.float32))
+    said = without_edges(measured, cue)
+    assert (said.confidence[:, 36:44] == 0).all()
+    np.testing.assert_array_equal(said.confidence[:, :30], measured.confidence[:, :30])
+    np.testing.assert_array_equal(said.confidence[:, 50:], measured.confidence[:, 50:])
+    beside = np.zeros(depth.shape, bool)
+    beside[:, 37:43] = True
+    errors = {}
+    places = np.argwhere((rng.random(depth.shape) < 0.2) & ~beside)
+    uv, log_z = places[:, ::-1].astype(np.float64), np.log(depth[places[:, 0], places[:, 1]]).astype(np.float64)
+    for name, matched in (("as it is", measured), ("without edges", said)):
+        known = known_depth(matched, uv, log_z, np.ones(depth.shape, bool), (HEIGHT, WIDTH))
+        fused = fuse_static(cue, matched, known, 0.01, 0.0, FusionConfig())
+        errors[name] = float(np.abs(fused.log_depth - np.log(depth))[beside].mean())
+    assert errors["without edges"] < 0.015
+    assert errors["without edges"] < errors["as it is"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -45,6 +45,7 @@ _PRIOR_SHARE = 0.05
 """... which counts as much as this part of the pixels around."""
 _BLUR_PX = 2
 """Matched edges are blurred by this, working px."""
+_BLUR_WINDOW = np.ones((2 * _BLUR_PX + 1,) * 2, np.uint8)
 _NEARBY_PX = 4.0
 _EDGE = 0.1
 """Change of log depth that is an edge."""
@@ -238,11 +239,28 @@ def held_out_errors(
     return HeldOut(of_cue, mean_error(np.log(measured.depth), sure) / max(mean_error(corrected, sure), _LEAST_ERROR))
 
 
+def without_edges(measured: Measured, cue: Float32Array) -> Measured:
+    """Return matched depth that says nothing beside edges, which a cue that does not bleed has sharper.
+
+    Args:
+        measured: Depth from several views.
+        cue: (h, w) m, NaN where missing.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_cue = np.log(cue)
+    log_cue = np.where(np.isfinite(log_cue), log_cue, np.log(measured.depth))
+    beside = (_beside_edges(measured) | _changes(log_cue)).astype(np.uint8)
+    said = np.where(cv2.dilate(beside, _BLUR_WINDOW) > 0, np.float32(0), measured.confidence)
+    return replace(measured, confidence=said)
+
+
 def _beside_edges(measured: Measured) -> BoolArray:
     """Return where matching, which blurs edges by its window, may have mixed two surfaces, (h, w)."""
-    seen = np.log(measured.depth)
-    window = np.ones((2 * _BLUR_PX + 1,) * 2, np.uint8)
-    return np.asarray(cv2.dilate(seen, window) - cv2.erode(seen, window) > _EDGE)
+    return _changes(np.log(measured.depth))
+
+
+def _changes(log_depth: Float32Array) -> BoolArray:
+    return np.asarray(cv2.dilate(log_depth, _BLUR_WINDOW) - cv2.erode(log_depth, _BLUR_WINDOW) > _EDGE)
 
 
 def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tuple[Float32Array, Float32Array]:
