@@ -295,7 +295,6 @@ class DenseMaps:
         return densify_frame(
             self._given(frame), mask, self.intrinsics[frame], self.control[frame],
             float(self.scene["log_scale"][frame]), float(self.scene["noise"][1]), self.config,
-            moving_only=self.config.static != "nearest_points",
         )  # fmt: skip
 
     def _static(self, frame: int) -> tuple[StaticDepth, Float32Array]:

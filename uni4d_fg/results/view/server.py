@@ -17,9 +17,6 @@ from uni4d_fg.errors import ConfigError, MissingDependencyError
 from uni4d_fg.optional import import_viser
 from uni4d_fg.results.view.page import answer_with_scripts
 
-DEFAULT_HOST = "127.0.0.1"
-DEFAULT_PORT = 8080
-
 
 def check_address(host: str, port: int) -> None:
     """Check that a server can listen there: viser itself would silently take another port.
