@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -61,6 +63,14 @@ def test_help_has_no_types_of_python(cli: Run) -> None:
             assert word not in options, (verb, word)
     out = cli("export", "--help")[1]
     assert all(name in out for name in ("colmap", "gsplat", "ply-frames", "uni4d"))
+
+
+def test_a_verb_does_not_wait_for_the_modules_of_others() -> None:
+    code = (
+        "import sys; from uni4d_fg.cli.main import run; run(['view', '--help']); "
+        "sys.exit(any('uni4d_fg.' + name in sys.modules for name in ('cli.benchmark', 'config.models', 'cues.plan')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0
 
 
 def test_version(cli: Run) -> None:

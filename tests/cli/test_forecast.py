@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from uni4d_fg.cli.expected_time import expected_time
 from uni4d_fg.cli.forecast import Forecast, ForecastReporter, Share, expected_shares
-from uni4d_fg.cli.main import app
+from uni4d_fg.cli.main import application
 from uni4d_fg.cli.progress import left, progress_reporter
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.plan import CuePlan
@@ -116,7 +116,7 @@ def test_doctor_says_where_time_will_go(tmp_path: Path) -> None:
     assert found["num_frames"] == 3
     assert sum(task["share"] for task in found["tasks"]) == pytest.approx(1.0)
     assert found["seconds"] == pytest.approx(sum(task["seconds"] for task in found["tasks"]))
-    answer = CliRunner().invoke(app, ["doctor", "--time", str(tmp_path / "clip")])
+    answer = CliRunner().invoke(application(), ["doctor", "--time", str(tmp_path / "clip")])
     assert answer.exit_code == 0
     assert answer.output.startswith("clip: 3 frames of 64 x 48 px, about ")
     assert len(answer.output.splitlines()) == 1 + len(tasks)

@@ -16,7 +16,7 @@ from stream_samples import feed, stream_config
 from stream_samples import stream as stream_of
 from typer.testing import CliRunner
 
-from uni4d_fg.cli.main import app
+from uni4d_fg.cli.main import application
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.write import write_native
@@ -126,13 +126,13 @@ def test_the_verb(tmp_path: Path) -> None:
     write_native(stream(10, objects="none"), tmp_path / "seq")
     run = tmp_path / "run"
     words = ["stream", str(tmp_path / "seq"), "--out", str(run), "--quiet"]
-    result = CliRunner().invoke(app, words)
+    result = CliRunner().invoke(application(), words)
     assert result.exit_code == 0, result.output
     assert "10 frames" in result.output
     assert "frames a second" in result.output
     assert load_reconstruction(run / "reconstruction.npz").num_frames == 10
-    assert CliRunner().invoke(app, words).exit_code != 0
-    again = CliRunner().invoke(app, [*words, "--overwrite"])
+    assert CliRunner().invoke(application(), words).exit_code != 0
+    again = CliRunner().invoke(application(), [*words, "--overwrite"])
     assert again.exit_code == 0, again.output
 
 
@@ -145,12 +145,12 @@ def test_the_verb_on_a_bare_video(tmp_path: Path) -> None:
         writer.write(image[:, :, ::-1])
     writer.release()
     words = ["stream", str(video), "--quiet", "--out", str(tmp_path / "run")]
-    refused = CliRunner().invoke(app, words)
+    refused = CliRunner().invoke(application(), words)
     assert refused.exit_code != 0
     assert "has no depth" in str(refused.exception or refused.output)
     assert not (tmp_path / "run").exists()
     depth = next(path for path in (tmp_path / "seq").iterdir() if path.name.startswith("depth_cue"))
-    result = CliRunner().invoke(app, [*words, "--depth", str(depth)])
+    result = CliRunner().invoke(application(), [*words, "--depth", str(depth)])
     assert result.exit_code == 0, result.output
     assert load_reconstruction(tmp_path / "run" / "reconstruction.npz").num_frames == 8
 

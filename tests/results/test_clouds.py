@@ -83,6 +83,20 @@ def test_own_files_are_read_as_open3d_reads_them(tmp_path: Path, with_normals: b
         assert mine.dtype == other.dtype
 
 
+def test_a_part_of_a_file_is_spread_over_all_of_it(tmp_path: Path) -> None:
+    points = np.stack((np.arange(1000.0), np.zeros(1000), np.zeros(1000)), axis=1)
+    colors = (points % 256).astype(np.uint8)
+    write_ply(tmp_path / "own.ply", points, colors)
+    # Not as write_ply leaves it.
+    (tmp_path / "other.ply").write_bytes((tmp_path / "own.ply").read_bytes().replace(b"uchar red", b"uint8 red"))
+    for name in ("own.ply", "other.ply"):
+        part, shade = read_ply(tmp_path / name, 50)
+        np.testing.assert_array_equal(part[:, 0] // 20, np.arange(50))
+        assert len(np.unique(np.diff(part[:, 0]))) > 5
+        np.testing.assert_array_equal(shade[:, 0], part[:, 0] % 256)
+        assert len(read_ply(tmp_path / name, 5000)[0]) == 1000
+
+
 def test_files_of_others_and_cut_ones_are_not_taken_for_own(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     write_ply(path, np.ones((4, 3)), np.ones((4, 3), np.uint8))

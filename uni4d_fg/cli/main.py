@@ -5,48 +5,27 @@ from __future__ import annotations
 import sys
 import traceback
 from enum import Enum
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 
-from uni4d_fg.cli import (
-    benchmark,
-    comparison,
-    cues,
-    doctor,
-    exports,
-    films,
-    graphs,
-    models,
-    reconstruction,
-    results,
-    sequences,
-    streaming,
-    viewing,
-)
 from uni4d_fg.cli.console import log_to_stderr, one_line, print_error
 from uni4d_fg.cli.failures import finish, known_error
 from uni4d_fg.errors import Cancelled
 
 UNEXPECTED_EXIT_CODE = 70
 
-app = typer.Typer(
-    name="uni4d-fg",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Turn a video of a moving world into camera poses, static geometry and 3D motion.",
-    epilog="Start with: uni4d-fg demo",
-)
-for verb in (
-    reconstruction.demo, doctor.doctor, sequences.validate, sequences.track, cues.cues, reconstruction.reconstruct,
-    streaming.stream,
-    results.evaluate, exports.export, graphs.graph, viewing.view, viewing.share, films.render, viewing.report,
-    comparison.compare, benchmark.benchmark, benchmark.ablate, sequences.synthesize, results.config,
-):  # fmt: skip
-    app.command()(verb)
-app.add_typer(models.app, name="models")
+_MODULES = {
+    "demo": "reconstruction", "doctor": "doctor", "validate": "sequences", "track": "sequences", "cues": "cues",
+    "reconstruct": "reconstruction", "stream": "streaming", "evaluate": "results", "export": "exports",
+    "graph": "graphs", "view": "viewing", "share": "viewing", "render": "films", "report": "viewing",
+    "compare": "comparison", "benchmark": "benchmark", "ablate": "benchmark", "synthesize": "sequences",
+    "config": "results",
+}  # fmt: skip
+"""The module of every verb, which is a function of its name there, in the order of the help."""
 
 
 def _show_version(wanted: bool) -> None:
@@ -58,8 +37,7 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
-def options(
+def _options(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show all log messages.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
     show_version: Annotated[
@@ -68,6 +46,28 @@ def options(
 ) -> None:
     """Take the options of every verb; ``--debug`` is dealt with in :func:`run`."""
     log_to_stderr(verbose)
+
+
+def application(asked: str | None = None) -> typer.Typer:
+    """Return the command line.
+
+    Args:
+        asked: The verb that will be called; the modules of others are then not loaded, which takes longer than some
+            verbs do. All are there if it is None or no verb.
+    """
+    app = typer.Typer(
+        name="uni4d-fg",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        callback=_options,
+        help="Turn a video of a moving world into camera poses, static geometry and 3D motion.",
+        epilog="Start with: uni4d-fg demo",
+    )
+    for verb in [asked] if asked in _MODULES else _MODULES:
+        app.command()(getattr(import_module(f"uni4d_fg.cli.{_MODULES[verb]}"), verb))
+    if asked not in _MODULES:
+        app.add_typer(import_module("uni4d_fg.cli.models").app, name="models")
+    return app
 
 
 _TYPE_NAMES = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
@@ -117,7 +117,8 @@ def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code."""
     debug = "--debug" in arguments
     try:
-        command = typer.main.get_command(app)
+        asked = next((word for word in arguments if not word.startswith("-")), None)
+        command = typer.main.get_command(application(asked))
         _tidy_help(command)
         command(args=[word for word in arguments if word != "--debug"], prog_name="uni4d-fg")
     except SystemExit as stop:

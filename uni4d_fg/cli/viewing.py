@@ -13,7 +13,7 @@ import typer
 
 from uni4d_fg.cli import options
 from uni4d_fg.cli.progress import progress_reporter
-from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.results.run_folder import RunFolder, is_finished
 
 if TYPE_CHECKING:
     from uni4d_fg.results.run import Run
@@ -28,27 +28,31 @@ def view(
     max_points: Annotated[int, typer.Option(help="Points of the static cloud that are sent.", min=1)] = 3_000_000,
 ) -> None:
     """Show a run in a browser: cameras, clouds and trajectories over time; of a run that is going on, what it has."""
-    from uni4d_fg.results.view.content import Limits
+    from uni4d_fg.results.shot_list import refuse_split
     from uni4d_fg.results.view.server import viewer_server
-    from uni4d_fg.results.view.viewer import Viewer
 
     # Ctrl-C is how a viewer is closed, so that it is no failure; a shell's background job is started deaf to it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt):
+    refuse_split(run)
+    is_finished(RunFolder(run), unfinished=True)
+    with contextlib.suppress(KeyboardInterrupt), viewer_server(host, port, "uni4d-fg") as server:
+        # A browser that waits loads the page while the rest of the program and the run are loaded.
+        from uni4d_fg.results.view.content import Limits
+        from uni4d_fg.results.view.viewer import Viewer
+
         opened = open_run(run, unfinished=True)
-        with viewer_server(host, port, f"uni4d-fg: {opened.name}") as server:
-            viewer = Viewer(server, opened, Limits(static_points=max_points))
-            shown = f"[{host}]" if ":" in host else host
-            typer.echo(f"{opened.name}: http://{shown}:{port} (Ctrl-C ends)")
-            sys.stdout.flush()
-            ended = threading.Event()
-            loading = threading.Thread(target=viewer.load, args=(ended.is_set,), daemon=True)
-            loading.start()
-            try:
-                viewer.run_until(lambda: False)
-            finally:
-                ended.set()
-                loading.join(_LOADING_ENDS_S)
+        viewer = Viewer(server, opened, Limits(static_points=max_points))
+        shown = f"[{host}]" if ":" in host else host
+        typer.echo(f"{opened.name}: http://{shown}:{port} (Ctrl-C ends)")
+        sys.stdout.flush()
+        ended = threading.Event()
+        loading = threading.Thread(target=viewer.load_when_seen, args=(ended.is_set,), daemon=True)
+        loading.start()
+        try:
+            viewer.run_until(lambda: False)
+        finally:
+            ended.set()
+            loading.join(_LOADING_ENDS_S)
 
 
 def report(

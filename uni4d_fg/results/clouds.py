@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, ImageArray
+from uni4d_fg.arrays import FloatArray, ImageArray, IntArray
 from uni4d_fg.errors import InputError, OutputError
 from uni4d_fg.files import atomic_path
 from uni4d_fg.optional import import_open3d
@@ -55,8 +55,12 @@ def write_ply(path: Path, points: FloatArray, colors: ImageArray, normals: Float
         stream.write(stored.tobytes())
 
 
-def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
+def read_ply(path: Path, limit: int | None = None) -> tuple[FloatArray, ImageArray]:
     """Read a colored cloud: points (N, 3), meters, and RGB (N, 3).
+
+    Args:
+        path: The ``.ply`` file.
+        limit: Most points read, from all over the file; the same every time.
 
     Raises:
         InputError: If the file is missing or no PLY.
@@ -68,13 +72,13 @@ def read_ply(path: Path) -> tuple[FloatArray, ImageArray]:
     announced = re.search(rb"\nelement vertex (\d{1,20})\r?\n", head)
     if announced is not None and int(announced[1]) > size:
         raise InputError(f"{path}: announces {int(announced[1])} points in {size} bytes; make the clouds again")
-    found = _read_own(path, head, size) or _read_any(path)
+    found = _read_own(path, head, size, limit) or _read_any(path, limit)
     if not np.isfinite(found[0]).all():
         raise InputError(f"{path}: has points or colors that are NaN or infinite; make the clouds again")
     return found
 
 
-def _read_own(path: Path, head: bytes, size: int) -> tuple[FloatArray, ImageArray] | None:
+def _read_own(path: Path, head: bytes, size: int, limit: int | None = None) -> tuple[FloatArray, ImageArray] | None:
     """Read a file as :func:`write_ply` leaves it; None if it is any other. Loading Open3D takes longer than this."""
     text, ended, _ = head.partition(b"end_header\n")
     found = re.fullmatch(_OWN_HEADER, text)
@@ -85,11 +89,21 @@ def _read_own(path: Path, head: bytes, size: int) -> tuple[FloatArray, ImageArra
     start, count = len(text) + len(ended), int(found["count"])
     if size != start + count * record.itemsize:
         return None
-    rows = np.fromfile(path, record, count, offset=start)
+    if limit is None or count <= limit:
+        rows = np.fromfile(path, record, count, offset=start)
+    else:
+        rows = np.memmap(path, record, "r", start, (count,))[_spread_rows(count, limit)]
     return np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64), np.ascontiguousarray(rows["rgb"])
 
 
-def _read_any(path: Path) -> tuple[FloatArray, ImageArray]:
+def _spread_rows(count: int, limit: int) -> IntArray:
+    """Return ``limit`` rows of ``count``, ascending: one of each part, at random, so that no pattern of rows shows."""
+    parts = np.arange(limit) + np.random.default_rng(0).random(limit)
+    rows: IntArray = (parts * (count / limit)).astype(np.int64).clip(0, count - 1)
+    return rows
+
+
+def _read_any(path: Path, limit: int | None = None) -> tuple[FloatArray, ImageArray]:
     """Read a PLY of any program by Open3D; white where it has no colors. Raises InputError."""
     open3d = import_open3d()
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
@@ -100,6 +114,9 @@ def _read_any(path: Path) -> tuple[FloatArray, ImageArray]:
         colors = np.ones_like(points)
     if not np.isfinite(colors).all():
         raise InputError(f"{path}: has points or colors that are NaN or infinite; make the clouds again")
+    if limit is not None and len(points) > limit:
+        rows = _spread_rows(len(points), limit)
+        points, colors = points[rows], colors[rows]
     return points, np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 

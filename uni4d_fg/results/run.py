@@ -22,12 +22,11 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.reading import is_present
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.labels_io import load_labels
 from uni4d_fg.results.preview import preview
-from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.results.run_folder import RunFolder, is_finished
 from uni4d_fg.results.summary_file import read_summary
 from uni4d_fg.slam.reconstruction import Reconstruction
 
@@ -79,15 +78,10 @@ class Run:
     def __init__(self, root: Path, read_sequence: SequenceReader | None = None, *, unfinished: bool = False) -> None:
         self.folder = folder = RunFolder(root)
         self._read_sequence = read_sequence
-        if not root.is_dir():
-            raise InputError(f"{root}: no such folder; give the folder of a run")
-        if not (is_present(folder.reconstruction) and is_present(folder.summary)):
-            if unfinished and read_sequence is not None and (root / "stages").is_dir():
-                self._open_unfinished(read_sequence)
-                return
-            if folder.config.is_file() or (root / "stages").is_dir():
-                raise InputError(f"{root}: the run is not finished; continue it with its command line and --resume")
-            raise InputError(f"{root}: holds no run; give the folder that `uni4d-fg reconstruct` wrote (--out)")
+        finished = is_finished(folder, unfinished=unfinished and read_sequence is not None)
+        if not finished and read_sequence is not None:
+            self._open_unfinished(read_sequence)
+            return
         self.reconstruction: Reconstruction = load_reconstruction(folder.reconstruction)
         self.summary: dict[str, Any] = read_summary(folder.summary)
 

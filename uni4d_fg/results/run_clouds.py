@@ -40,13 +40,16 @@ class ColoredPoints(NamedTuple):
         return ColoredPoints(self.points[keep], self.colors[keep], self.instance[keep])
 
 
-def static_cloud(run: Run, fusion: FusionConfig, max_frames: int = 0) -> tuple[ColoredPoints | None, str]:
+def static_cloud(
+    run: Run, fusion: FusionConfig, max_frames: int = 0, limit: int | None = None
+) -> tuple[ColoredPoints | None, str]:
     """Return the cloud of what does not move, if the run has one, and where it is from: 'files', 'depth' or 'none'.
 
     Args:
         run: The run.
         fusion: Strides, voxel size and edges of a cloud that is made from depth.
         max_frames: Frames that such a cloud takes at most; as ``fusion`` says for 0.
+        limit: Most points that are read of a file; all if None.
 
     Raises:
         InputError: If a file cannot be read.
@@ -54,7 +57,7 @@ def static_cloud(run: Run, fusion: FusionConfig, max_frames: int = 0) -> tuple[C
     """
     path = run.folder.static_cloud
     if path.is_file():
-        points, colors = read_ply(path)
+        points, colors = read_ply(path, limit)
         return ColoredPoints.of(points, colors, np.zeros(len(points), np.int32)), "files"
     sequence, depth, result = run.sequence, run.depth, run.reconstruction
     if sequence is None or depth is None:

@@ -1,9 +1,12 @@
-"""The names of the files in the folder of a run."""
+"""The names of the files in the folder of a run, and whether it holds one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+
+from uni4d_fg.errors import InputError
+from uni4d_fg.reading import is_present
 
 
 @dataclass(frozen=True)
@@ -94,3 +97,26 @@ class RunFolder:
     def exports(self) -> Path:
         """Folder of the run in the formats of other programs, where they were asked for."""
         return self.root / "export"
+
+
+def is_finished(folder: RunFolder, *, unfinished: bool = False) -> bool:
+    """Tell whether a folder holds a finished run, as far as its names say.
+
+    Args:
+        folder: The run's folder.
+        unfinished: A run that is going on is no error.
+
+    Raises:
+        InputError: If there is no such folder, or it holds no run, or one that is going on.
+    """
+    root = folder.root
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; give the folder of a run")
+    if is_present(folder.reconstruction) and is_present(folder.summary):
+        return True
+    going_on = (root / "stages").is_dir()
+    if unfinished and going_on:
+        return False
+    if going_on or folder.config.is_file():
+        raise InputError(f"{root}: the run is not finished; continue it with its command line and --resume")
+    raise InputError(f"{root}: holds no run; give the folder that `uni4d-fg reconstruct` wrote (--out)")

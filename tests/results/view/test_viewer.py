@@ -21,7 +21,9 @@ from viewing_samples import NUM_FRAMES, browser_page, copied, free_port, opened
 
 from uni4d_fg import optional
 from uni4d_fg.cli import main
-from uni4d_fg.errors import ConfigError, MissingDependencyError
+from uni4d_fg.errors import ConfigError, InputError, MissingDependencyError
+from uni4d_fg.results.clouds import read_ply
+from uni4d_fg.results.view import viewer as viewer_module
 from uni4d_fg.results.view.content import Limits, RunClouds
 from uni4d_fg.results.view.panel import Panel
 from uni4d_fg.results.view.server import check_address, is_own_page, viewer_server
@@ -146,6 +148,26 @@ def test_everything_is_sent_once_and_frames_only_show_and_hide(finished_run: Pat
         viewer.panel.history.value, viewer.panel.trail.value = 1, 2
         viewer.refresh()
         assert visible(server, "/moving/cloud/") == visible(server, "/moving/steps/") == ["00002", "00003"]
+
+
+def test_a_part_of_the_cloud_comes_first_and_the_rest_when_a_browser_has_drawn_it(
+    finished_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("FIRST_POINTS", 300), ("_PATIENCE_SECONDS", 0.2), ("_HEAD_START_SECONDS", 0.1)):
+        monkeypatch.setattr(viewer_module, name, value)
+
+    def static_points() -> int:
+        nodes = server.scene._handle_from_node_name.items()
+        return sum(len(node.points) for name, node in nodes if re.fullmatch(r"/static/cloud/\d+/\d+", name))
+
+    with viewer_server("127.0.0.1", free_port(), "a run") as server:
+        run = opened(finished_run).with_parts(sequence=InputError("moved away"))
+        viewer = Viewer(server, run)
+        assert static_points() == 300
+        began = time.monotonic()
+        viewer.load_when_seen()
+        assert time.monotonic() - began > 0.2
+        assert static_points() == len(read_ply(run.folder.static_cloud)[0]) > 300
 
 
 def test_a_frame_that_stands_still_is_filled_in(finished_run: Path) -> None:

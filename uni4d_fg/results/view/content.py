@@ -51,10 +51,15 @@ class RunClouds:
             fusion = FusionConfig()
         self.fusion = fusion.model_copy(update={"dynamic_stride": 1})
 
-    def static(self) -> tuple[ColoredPoints, str]:
-        """Return the static cloud that is at hand, and where it comes from: 'files', 'depth' or 'none'."""
-        cloud, source = static_cloud(self.run, self.fusion, _MAX_LIFTED_FRAMES)
-        return (NOTHING if cloud is None else cloud.thinned(self.limits.static_points)), source
+    def static(self, limit: int | None = None) -> tuple[ColoredPoints, str]:
+        """Return the static cloud that is at hand, and where it comes from: 'files', 'depth' or 'none'.
+
+        Args:
+            limit: Points that are enough; a part of a file is read sooner.
+        """
+        most = min(limit or self.limits.static_points, self.limits.static_points)
+        cloud, source = static_cloud(self.run, self.fusion, _MAX_LIFTED_FRAMES, most)
+        return (NOTHING if cloud is None else cloud.thinned(most)), source
 
     def dense_static(self, should_stop: Callable[[], bool] = lambda: False) -> ColoredPoints | None:
         """Return the static cloud at the images' resolution; None without images or depth. Takes seconds."""

@@ -14,7 +14,8 @@ from uni4d_fg.results.view.coloring import Coloring
 from uni4d_fg.results.view.nodes import CloudNode, add_cloud, add_group, add_marks
 from uni4d_fg.results.view.shown import Shown
 
-_FIRST_POINTS = 60_000
+FIRST_POINTS = 60_000
+"""Of the part of the cloud that is there at once."""
 _MARK_SIZE = 0.006
 """Diameter of a landmark, in parts of the scene's depth."""
 
@@ -44,11 +45,6 @@ class StaticLayer:
             self._landmarks = add_marks(
                 self.server, "/static/landmarks/points", points, colors, _MARK_SIZE * self.depth
             )
-
-    def show_first(self, cloud: ColoredPoints, coloring: Coloring, factor: float) -> None:
-        """Show a thin part of a cloud, which is there at once."""
-        thin = cloud.thinned(_FIRST_POINTS)
-        self.replace_by(thin, self.send(thin, coloring, factor))
 
     def send(self, cloud: ColoredPoints, coloring: Coloring, factor: float) -> CloudNode:
         """Add a cloud to the scene; it is not this layer's yet, so that other threads may go on with what is."""

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.arrays import evenly_spread
+from uni4d_fg.errors import InputError
 from uni4d_fg.results.measures import scene_depth
 from uni4d_fg.results.run import Run
+from uni4d_fg.results.run_clouds import ColoredPoints
 from uni4d_fg.results.view.camera_layer import CameraLayer, ObjectLayer
 from uni4d_fg.results.view.coloring import ColorBy, Coloring, as_html, values_of
 from uni4d_fg.results.view.content import Limits, RunClouds
@@ -21,11 +23,13 @@ from uni4d_fg.results.view.framing import FOV_RAD, Framing, first_view
 from uni4d_fg.results.view.nodes import quaternion, vertical_fov
 from uni4d_fg.results.view.panel import Panel
 from uni4d_fg.results.view.shown import Shown
-from uni4d_fg.results.view.static_layer import StaticLayer
+from uni4d_fg.results.view.static_layer import FIRST_POINTS, StaticLayer
 
 CAMERA_SIZE = 0.035
 """Size of the current camera, in parts of the scene's depth."""
 _IDLE_SECONDS = 0.03
+_PATIENCE_SECONDS, _HEAD_START_SECONDS = 10.0, 0.7
+"""What is not in the first picture waits so long for a browser, and then for the browser to draw."""
 _STILL_SECONDS = 0.3
 """The time must stand still for so long before every pixel of a frame is sent."""
 
@@ -42,7 +46,8 @@ class Viewer:
         reconstruction = run.reconstruction
         self._depth = scene_depth(reconstruction)
         self._clouds = RunClouds(run, limits)
-        self._static_cloud, self._source = self._clouds.static()
+        first, self._source = self._clouds.static(FIRST_POINTS)
+        self._seen = threading.Event()
         self._values = values_of(run)
         self._shown = Shown(landmarks=self._source == "none")
         self._coloring = Coloring(ColorBy.image, run, self._values)
@@ -60,10 +65,10 @@ class Viewer:
         self.panel.objects.visible = self._objects.count > 0
         self.panel.notes.content = _notes(run, self._source, limits)
         self._changed = time.monotonic()
-        self._prepare_scene()
+        self._prepare_scene(first)
         self._attach()
 
-    def _prepare_scene(self) -> None:
+    def _prepare_scene(self, first: ColoredPoints) -> None:
         view = first_view(self._run.reconstruction, self._depth)
         self._server.scene.set_up_direction(view.up)
         camera = self._server.initial_camera
@@ -71,7 +76,8 @@ class Viewer:
         camera.near, camera.far = 1e-3 * self._depth, 1e3 * self._depth
         with self._server.atomic():
             self._static.build(self._coloring, self._shown)
-            self._static.show_first(self._static_cloud, self._coloring, self._shown.point_size)
+            first_node = self._static.send(first, self._coloring, self._shown.point_size)
+            self._static.replace_by(first, first_node)
             self._frames.build(self._shown)
             self._cameras.build(self._coloring, self._shown)
             self._load_frame(0)
@@ -88,19 +94,36 @@ class Viewer:
         panel.add_keys(self.step)
         self._server.on_client_connect(self._welcome)
 
+    def load_when_seen(self, should_stop: Callable[[], bool] = lambda: False) -> None:
+        """Do what :meth:`load` does when a browser shows the first picture, which would come later with it."""
+        deadline = time.monotonic() + _PATIENCE_SECONDS
+        while not should_stop() and time.monotonic() < deadline and not self._seen.wait(_IDLE_SECONDS):
+            pass
+        if self._seen.is_set():
+            time.sleep(_HEAD_START_SECONDS)
+        self.load(should_stop)
+
     def load(self, should_stop: Callable[[], bool] = lambda: False) -> None:
         """Send everything that is not there yet: the whole static cloud, all frames, then the dense static cloud."""
-        if len(self._static_cloud.points) > self._static.num_points:
-            self._send_static(self._static_cloud)
+        if self._source == "files" and not should_stop():
+            self._send_file()
         for frame in range(self._run.num_frames):
             if should_stop():
                 return
             with self._lock:
                 self._load_frame(frame)
         dense = self._clouds.dense_static(should_stop)
-        if dense is not None and len(dense.points) > len(self._static_cloud.points) and not should_stop():
-            self._static_cloud = dense
+        if dense is not None and len(dense.points) > self._static.num_points and not should_stop():
             self._send_static(dense)
+
+    def _send_file(self) -> None:
+        try:
+            whole, _ = self._clouds.static()
+        except InputError as error:
+            self.panel.notes.content += as_html([f"⚠ {error}"])
+            return
+        if len(whole.points) > self._static.num_points:
+            self._send_static(whole)
 
     def _send_static(self, cloud: Any) -> None:
         coloring, factor = self._coloring, self._shown.point_size
@@ -201,6 +224,7 @@ class Viewer:
             self._look_through(list(self._server.get_clients().values()))
 
     def _welcome(self, client: Any) -> None:
+        self._seen.set()
         if 0.0 < client.camera.aspect < 1.0:
             _point(client, first_view(self._run.reconstruction, self._depth, client.camera.aspect))
 
