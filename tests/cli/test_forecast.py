@@ -14,6 +14,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.plan import CuePlan
 from uni4d_fg.frontend.sequence.write import write_native
 from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import SilentReporter
 
 SIZE = (480, 640)
@@ -46,7 +47,7 @@ def simulated(shares: list[Share], really: list[float], measured: set[str]) -> l
 
 @pytest.mark.parametrize("pace", [0.2, 1.0, 7.0])
 def test_a_run_of_the_expected_shares_is_told_at_any_pace(pace: float) -> None:
-    shares = expected_shares(60, SIZE, Config(), CuePlan(depth="geometry", masks="motion"), has_tracks=False)
+    shares = expected_shares(60, SIZE, Config(), CuePlan(depth="geometry", masks="motion"), None)
     really = [pace * share.seconds for share in shares]
     told = simulated(shares, really, {"tracks", "fusion", "depth maps"})
     later = [total for part, total in told if part > 0.1]
@@ -58,7 +59,7 @@ def test_a_run_of_the_expected_shares_is_told_at_any_pace(pace: float) -> None:
 
 
 def test_shares_that_are_off_by_a_third_each_still_tell_the_time(rng: np.random.Generator) -> None:
-    shares = expected_shares(60, SIZE, Config(), CuePlan(), has_tracks=False)
+    shares = expected_shares(60, SIZE, Config(), CuePlan(), None)
     for _ in range(20):
         really = [share.seconds * float(np.exp(rng.uniform(-0.25, 0.25))) for share in shares]
         told = simulated(shares, really, {"tracks", "fusion"})
@@ -94,6 +95,49 @@ def test_tasks_that_are_left_out_or_unknown_do_no_harm() -> None:
     assert rest > 0
     forecast.end()
     assert forecast.state()[0] == pytest.approx(1.0)
+
+
+def test_a_task_that_takes_three_times_as_long_corrects_itself_and_not_those_behind_it() -> None:
+    clock = Clock()
+    forecast = Forecast([Share("a", 10), Share("b", 10), Share("c", 10)], clock)
+    forecast.begin("a", None)
+    clock.now += 10
+    forecast.begin("b", 10)
+    # Preparation, which no part of the work stands for.
+    clock.now += 6
+    assert forecast.state()[1] == pytest.approx(20.0)
+    forecast.advance(0.1)
+    for part in range(2, 6):
+        clock.now += 3
+        forecast.advance(part / 10)
+    rest = forecast.state()[1]
+    assert rest is not None
+    # Own pace: 15 s for the second half; the pace of all, which c takes, is (10 + 12) s for 10 + 4 expected ones.
+    assert rest == pytest.approx(15.0 + 10 * 22 / 14)
+
+
+def test_what_passes_between_two_tasks_belongs_to_the_second() -> None:
+    clock = Clock()
+    forecast = Forecast([Share("a", 10), Share("b", 20), Share("c", 10)], clock)
+    forecast.begin("a", None)
+    clock.now += 10
+    forecast.end()
+    clock.now += 30
+    forecast.begin("b", None)
+    clock.now += 10
+    forecast.end()
+    assert forecast.state() == (pytest.approx(0.75), pytest.approx(10 * 50 / 30))
+
+
+def test_given_tracks_say_how_large_bundle_adjustment_is() -> None:
+    def seconds(count: int) -> float:
+        visible = np.ones((count, 60), bool)
+        uv, start = np.zeros((count, 60, 2), np.float32), np.zeros(count, np.int32)
+        shares = expected_shares(60, SIZE, Config(), CuePlan(), Tracks(uv, visible, start))
+        return next(share.seconds for share in shares if share.task == "bundle adjustment")
+
+    assert seconds(4000) - seconds(2000) == pytest.approx(seconds(6000) - seconds(4000))
+    assert seconds(4000) > 1.5 * seconds(2000)
 
 
 def test_lines_say_how_long_it_will_take(capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,9 +32,7 @@ def expected_time(path: Path, config: str | None) -> dict[str, Any]:
     )  # fmt: skip
     opened = source.open()
     video = opened.video
-    shares = expected_shares(
-        video.num_frames, video.image_size, settings, source.plan(opened), has_tracks=video.tracks is not None
-    )
+    shares = expected_shares(video.num_frames, video.image_size, settings, source.plan(opened), video.tracks)
     total = sum(share.seconds for share in shares)
     return {
         "name": video.name,

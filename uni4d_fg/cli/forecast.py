@@ -7,15 +7,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from uni4d_fg.progress import Reporter
 
 if TYPE_CHECKING:
     from uni4d_fg.config.models import Config
     from uni4d_fg.cues.plan import CuePlan
+    from uni4d_fg.frontend.track_model import Tracks
 
 _FIRST_TELLING = 0.06
 """Part of the work that must be done before a time is told."""
 _ALMOST = 0.95
+_TRUSTED = 0.3
+"""Of a task that says how far it is: the part from which on its own pace alone says how long it will take."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class Share:
 
 @dataclass
 class Forecast:
-    """Follows the tasks of a run.
+    """Follows the tasks of a run. What passes between two tasks is counted as the second one's.
 
     Args:
         shares: Tasks in the order in which they come; those that are left out, or come that are not among them, do no
@@ -44,7 +49,15 @@ class Forecast:
     """Shares before it are done, left out, or going on."""
     _current: Share | None = None
     _began: float = 0.0
+    """When the current task began."""
+    _going: bool = False
+    """Whether a task is going on, be it among the shares or not."""
+    _since: float | None = None
+    """When the last task ended; None before the first."""
     _part: float = 0.0
+    """As the current task says."""
+    _first: tuple[float, float] | None = None
+    """The part that the current task told first, and when: what came before is preparation."""
     _measured: bool = False
     """Whether the current task says how far it is."""
     _expected: float = field(default=0.0)
@@ -56,6 +69,9 @@ class Forecast:
         """Say that a task begins."""
         self.end()
         self._began, self._part, self._measured = self.clock(), 0.0, bool(total)
+        self._since = self._began if self._since is None else self._since
+        self._going = True
+        self._first = None
         for number in range(self._next, len(self.shares)):
             if self.shares[number].task == task:
                 self._current, self._next = self.shares[number], number + 1
@@ -64,37 +80,66 @@ class Forecast:
     def advance(self, part: float) -> None:
         """Say which part of the current task is done."""
         self._part = min(max(part, 0.0), 1.0)
+        self._first = self._first or (self._part, self.clock())
 
     def end(self) -> None:
         """Say that the current task is finished."""
         if self._current is not None:
             self._expected += self._current.seconds
-            self._taken += self.clock() - self._began
-        self._current = None
+            self._taken += self._passed()
+            self._current = None
+        if self._going:
+            self._since = self.clock()
+        self._going = False
 
     def state(self) -> tuple[float, float | None]:
         """Return the part of the work that is done, and the seconds that are left; None while nobody can know."""
         rest = sum(share.seconds for share in self.shares[self._next :])
-        done, taken, here = self._expected, self._taken, 0.0
-        if self._current is not None:
-            inside = self.clock() - self._began
-            taken += inside
-            here = self._current.seconds * self._inside(inside)
-            rest += self._current.seconds - here
-        done += here
-        whole = done + rest
-        if whole <= 0.0:
-            return 0.0, None
-        part = done / whole
-        return part, (rest * taken / done if part >= _FIRST_TELLING else None)
+        current = 0.0 if self._current is None else self._current.seconds
+        inside = self._inside()
+        done = self._expected + inside * current
+        whole = self._expected + current + rest
+        if whole <= 0.0 or done < _FIRST_TELLING * whole:
+            return (done / whole if whole > 0.0 else 0.0), None
+        pace = self._pace()
+        return done / whole, pace * rest + self._left_here(pace * current, inside)
 
-    def _inside(self, seconds: float) -> float:
+    def _passed(self) -> float:
+        """Return the seconds of the current task, with those before it that are counted as its own."""
+        return self.clock() - (self._began if self._since is None else self._since)
+
+    def _pace(self) -> float:
+        """Return the seconds that an expected second takes: by what is finished, and what a task says is."""
+        expected, taken = self._expected, self._taken
+        if self._measured and self._current is not None and self._first is not None:
+            part, began = self._first if self._expected else (0.0, self._began)
+            expected += (self._part - part) * self._current.seconds
+            taken += self.clock() - began
+        return taken / expected if expected > 0.0 else 1.0
+
+    def _inside(self) -> float:
         """Return the part of the current task that is done: as it says, or by the pace of those before it."""
+        if self._current is None:
+            return 0.0
         if self._measured:
             return self._part
-        assert self._current is not None
         pace = self._taken / self._expected if self._expected else 1.0
-        return min(seconds / max(pace * self._current.seconds, 1e-9), _ALMOST)
+        return min(self._passed() / max(pace * self._current.seconds, 1e-9), _ALMOST)
+
+    def _left_here(self, expected: float, inside: float) -> float:
+        """Return the seconds that the current task will still take: more and more by its own pace, where it has one.
+
+        Args:
+            expected: Seconds of the whole task, by the pace of all.
+            inside: Part of it that is done.
+        """
+        left = (1.0 - inside) * expected
+        if not self._measured or self._first is None or self._part <= self._first[0]:
+            return left
+        part, began = self._first
+        own = (self.clock() - began) * (1.0 - self._part) / (self._part - part)
+        weight = min(self._part / _TRUSTED, 1.0)
+        return weight * own + (1.0 - weight) * left
 
 
 @dataclass
@@ -129,22 +174,23 @@ class ForecastReporter:
 
 
 def expected_shares(
-    num_frames: int, image_size: tuple[int, int], config: Config, plan: CuePlan, *, has_tracks: bool
+    num_frames: int, image_size: tuple[int, int], config: Config, plan: CuePlan, tracks: Tracks | None
 ) -> list[Share]:
     """Return the tasks of a reconstruction.
 
-    The costs were measured on videos of 10 to 60 frames of 0.08 to 0.3 megapixels; they are per megapixel of the whole
-    video, beside a constant. How many points there are is not known before.
+    The costs are processor seconds of videos of 24 to 65 frames of 0.08 to 0.3 megapixels: a constant, and so much per
+    megapixel of the whole video. How many points there are is not known before, nor whether depth is matched between
+    frames, which makes fusion 0.5 to 6 s per megapixel: it is taken for one between.
 
     Args:
         num_frames: T.
         image_size: (height, width), px.
         config: Which stages there are.
         plan: Which cues are made.
-        has_tracks: The video brings tracks.
+        tracks: Those that the video brings.
     """
     size = num_frames * image_size[0] * image_size[1] / 1e6
-    tracking = 0.1 + 0.43 * size
+    tracking = 0.3 + 0.8 * size
     shares: list[Share] = []
 
     def add(task: str, constant: float, per_megapixel: float) -> None:
@@ -152,31 +198,36 @@ def expected_shares(
 
     moved = plan.depth == "geometry"
     if not plan.is_given:
-        if not has_tracks:
+        if tracks is None:
             shares.append(Share("tracks", tracking))
         if moved:
             _motion(add)
         if plan.masks == "motion":
-            add("motion of tracks", 0.5, 0.8)
-            add("motion masks", 0.2, 0.3)
+            add("motion of tracks", 3.0, 0.4)
+            add("motion masks", 0.5, 0.6)
             add("masks to disk", 0.1, 0.02)
             if moved:
                 _motion(add)
-    known = has_tracks or not plan.is_given
-    shares.append(Share("tracks", 0.1 + 0.03 * size if known else tracking))
-    add("lens", 1.8, 0.02)
-    add("camera init", 0.2, 0.01)
-    add("bundle adjustment", 1.3, 0.46)
-    add("nonrigid", 0.3, 0.12)
+    known = tracks is not None or not plan.is_given
+    shares.append(Share("tracks", 0.05 + 0.02 * size if known else tracking))
+    add("lens", 0.55, 0.03)
+    add("camera init", 0.25, 0.0)
+    if tracks is None:
+        add("bundle adjustment", 0.5, 1.4)
+    else:
+        add("bundle adjustment", 0.05 + 2.2e-5 * float(np.count_nonzero(tracks.visible)), 0.0)
+    add("nonrigid", 0.2, 0.12)
     if config.joint.enabled:
         add("joint", 0.5, 0.6)
-    add("fusion", 1.0, 0.4)
-    add("clouds and pictures", 3.0, 0.2)
+    add("fusion", 6.3 + 0.1 * num_frames, 0.95)
+    add("clouds and pictures", 3.0, 0.05)
     return shares
 
 
 def _motion(add: Callable[[str, float, float], None]) -> None:
     """Add the tasks of depth from camera motion."""
-    add("structure from motion", 1.0, 2.5)
+    add("starting views", 3.0, 0.1)
+    add("structure from motion", 1.0, 0.1)
+    add("focal lengths", 3.0, 0.15)
     add("depth of moving things", 0.1, 0.2)
-    add("depth maps", 0.1, 0.15)
+    add("depth maps", 0.1, 0.3)

@@ -115,9 +115,7 @@ def reconstruct(
     read_measurements(files, opened.video.timestamps, settings.measurements)
 
     def solve(video: Video, folder: Path, again: bool, warnings: tuple[str, ...] = ()) -> tuple[RunSummary, Sequence]:
-        forecast = Forecast(
-            expected_shares(video.num_frames, video.image_size, settings, plan, has_tracks=video.tracks is not None)
-        )
+        forecast = Forecast(expected_shares(video.num_frames, video.image_size, settings, plan, video.tracks))
         sequence, report = run_cues(video, plan, folder, settings, quiet=quiet, forecast=forecast)
         chosen = settings if report is None or report.settings is None else report.settings
         summary = run_pipeline(
@@ -183,9 +181,7 @@ def demo(
         mark_run(out)
         source.save(out)
         sequence = source.read()
-        shares = expected_shares(
-            sequence.num_frames, sequence.image_size, settings, CuePlan(), has_tracks=sequence.tracks is not None
-        )
+        shares = expected_shares(sequence.num_frames, sequence.image_size, settings, CuePlan(), sequence.tracks)
         summary = run_pipeline(sequence, out, settings, resume=resume, quiet=quiet, forecast=Forecast(shares))
         report = evaluate_run(out, sequence)
     if json:

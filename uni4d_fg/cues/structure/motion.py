@@ -69,7 +69,7 @@ def structure_from_motion(
         image_size: (height, width), px.
         intrinsics: (4,) known, or a guess when ``config.input.intrinsics`` is 'free'.
         config: Sections ``geometric_depth``, ``bundle_adjustment`` and ``input``.
-        reporter: Told the number of frames that have a pose.
+        reporter: Told the steps, and the number of frames that have a pose.
         should_stop: Polled before every frame.
 
     Returns:
@@ -86,7 +86,9 @@ def structure_from_motion(
     used = observations.select(spread_tracks(observations, image_size, settings.max_tracks))
     outlier = epipolar_outliers(used, num_frames, image_size, settings)[used.rows()[1]]
     competition = Competition(used, outlier, num_frames, image_size, intrinsics, config, free_focal, should_stop)
+    reporter.begin("starting views", None)
     hypotheses = competition.run()
+    reporter.end()
     if not hypotheses:
         return None
     best = hypotheses[0]
@@ -96,6 +98,7 @@ def structure_from_motion(
     )  # fmt: skip
     scene.continue_from(best.scene)
     grow(scene, reporter)
+    reporter.begin("focal lengths", None)
     scene.measure_noise()
     scene.adjust(CONVERGED)
     sigma = scene.measure_noise()
@@ -107,6 +110,7 @@ def structure_from_motion(
         usual = np.array(settings.usual_focal) * max(image_size)
         others = [rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]]
         focal = focal.holding(others)
+    reporter.end()
     return Structure(
         poses, scene.intrinsics, scene.registered, track, points, sigma, best.pair, focal, best.unexplained, rivals
     )  # fmt: skip
