@@ -18,7 +18,7 @@ from uni4d_fg.pipeline.steps import nonrigid_step, stop_if_cancelled
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.slam.stages.scene import Cameras
-from uni4d_fg.slam.windows.join import WindowInformation
+from uni4d_fg.slam.windows.information import WindowInformation
 from uni4d_fg.slam.windows.numbered import NumberedRunner
 from uni4d_fg.slam.windows.plan import TrackSpans, Window, WindowTracks
 from uni4d_fg.slam.windows.scene import (

@@ -28,7 +28,8 @@ from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.slam.reconstruction import Reconstruction
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.added_terms import added_terms
-from uni4d_fg.slam.windows.join import WindowInformation, join
+from uni4d_fg.slam.windows.information import WindowInformation
+from uni4d_fg.slam.windows.join import join
 from uni4d_fg.slam.windows.plan import Window
 
 FRAMES = 24

@@ -24,9 +24,8 @@ from uni4d_fg.optim.added_factors import AddingRunner, JoinedStage
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.slam.stages.scene import Cameras
+from uni4d_fg.slam.windows.information import FRAME
 
-FRAME = 7
-"""Columns per frame: twist, log-scale. The intrinsics' four follow, and then the added variables'."""
 _ROWS = 600
 """Rows of right-hand sides at a time."""
 

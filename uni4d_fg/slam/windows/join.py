@@ -8,7 +8,7 @@ where T_0 is the pose of its first frame: only poses relative to it, log-scales 
 knows nothing of where the others put the world. The sum over windows is minimized by Gauss-Newton over all poses
 (frame 0 held) and log-scales; the intrinsics are held, as short windows tell them worse than frames far apart do, and
 count as uncertain as these say in the covariances. The matrix has one block per window and a border for the
-intrinsics, and is factorized as a sparse one.
+intrinsics; see :mod:`uni4d_fg.slam.windows.fronts`.
 Source: Ni, Steedly and Dellaert 2007, "Tectonic SAM: exact, out-of-core, submap-based SLAM".
 """
 
@@ -17,63 +17,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry import se3
-from uni4d_fg.geometry.se3 import inverse_right_jacobian, se3_log
-from uni4d_fg.optim.cluster_robust import MIN_CLUSTERS, Spread
-from uni4d_fg.optim.few_clusters import blend
+from uni4d_fg.geometry.se3 import se3_log
 from uni4d_fg.slam.stages.scene import Cameras
-from uni4d_fg.slam.windows.added_terms import FRAME, AddedTerms, Entries
+from uni4d_fg.slam.windows.added_terms import AddedTerms
+from uni4d_fg.slam.windows.fronts import FrontChain
+from uni4d_fg.slam.windows.information import FRAME, WindowInformation
+from uni4d_fg.slam.windows.join_covariance import joined_covariances
 from uni4d_fg.slam.windows.plan import Window
+from uni4d_fg.slam.windows.sparse_sum import SparseSum
 
 _STEP_SIZE = 1e-9
 """A Gauss-Newton step below this ends the solve (rad, m, log)."""
 _MAX_STEPS = 10
 _MAX_STEPS_ADDED = 50
 """With added factors, whose kernels are reweighted from step to step."""
-
-
-@dataclass(frozen=True)
-class WindowInformation:
-    """What one window knows: columns are 7 per frame (twist, log-scale) and 4 for the intrinsics."""
-
-    window: Window
-    point: Cameras
-    """Linearization point, in the axes of the window's first camera."""
-    hessian: FloatArray
-    """(n, n); zero in the columns of the first pose."""
-    gradient: FloatArray
-    """(n,)."""
-    curvature: FloatArray
-    """(n, n) the Hessian with the mean slopes of the kernels, for covariances."""
-    spread: Spread | None
-    """Of the gradient; None where errors count as independent."""
-
-    def columns(self, num_frames: int) -> IntArray:
-        """Return the place (n,) of its columns among those of all frames."""
-        frames = np.arange(FRAME * self.window.start, FRAME * self.window.stop)
-        return np.concatenate([frames, FRAME * num_frames + np.arange(4)])
-
-    def difference(self, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
-        """Return d (n,) and its Jacobian (n, n) with respect to the shared cameras' tangents."""
-        here, count = cameras.part(self.window.start, self.window.stop), len(self.window)
-        twist = se3_log(se3.inverse(self.point.world_T_cam) @ here.world_T_cam)
-        inverse_jacobian = inverse_right_jacobian(twist)
-        d, jacobian = np.zeros(FRAME * count + 4), np.eye(FRAME * count + 4)
-        for i in range(count):
-            own = slice(FRAME * i, FRAME * i + 6)
-            d[own] = twist[i]
-            jacobian[own, own] = inverse_jacobian[i] if i else 0.0
-            if i:
-                back = se3.adjoint(se3.inverse(here.world_T_cam[i]))
-                jacobian[own, :6] = -inverse_jacobian[i] @ back
-        d[6 : FRAME * count : FRAME] = here.log_scale - self.point.log_scale
-        d[-4:] = here.intrinsics - self.point.intrinsics
-        return d, jacobian
 
 
 @dataclass(frozen=True)
@@ -132,26 +93,24 @@ def join(
     """
     cameras, num_frames = start, len(start.world_T_cam)
     base = FRAME * num_frames + 4
-    size = base if added is None else added.size
-    free = np.ones(size, dtype=bool)
-    free[:6] = False
-    if added is not None:
-        free = added.free
+    free = np.ones(base, dtype=bool) if added is None else added.free
+    if added is None:
+        free[:6] = False
     free[base - 4 : base] = False
-    at = np.flatnonzero(free)
     for _ in range(_MAX_STEPS if added is None else _MAX_STEPS_ADDED):
-        gradient, entries = np.zeros(size), []
+        gradient, matrices = np.zeros(len(free)), []
         for part in information:
             d, jacobian = part.difference(cameras)
-            entries.append(_entries(part, jacobian.T @ part.hessian @ jacobian, num_frames))
+            matrices.append(jacobian.T @ part.hessian @ jacobian)
             gradient[part.columns(num_frames)] += jacobian.T @ (part.hessian @ d + part.gradient)
-        if added is not None:
-            slope, more = added.linearize(cameras)
+        solver: FrontChain | SparseSum
+        if added is None:
+            solver = FrontChain([part.window for part in information], matrices, free, FRAME)
+        else:
+            slope, entries = added.linearize(cameras)
             gradient += slope
-            entries += more
-        solver = _factorize(entries, size, at)
-        step = np.zeros(size)
-        step[at] = -solver.solve(gradient[at])
+            solver = SparseSum(information, matrices, entries, free)
+        step = -solver.solve(gradient[None])[0]
         if not np.isfinite(step).all():
             raise SolverError("joining windows: a step is not finite; use longer windows or a wider overlap")
         cameras = _moved(cameras, step[:base])
@@ -161,129 +120,14 @@ def join(
             break
     if not covariance:
         return Joined(cameras, np.full((num_frames, 6, 6), np.nan), np.full((4, 4), np.nan))
-    uncertain = base - 4 + np.flatnonzero(np.diag(intrinsics_covariance) > 0)
+    uncertain = np.diag(intrinsics_covariance) > 0
+    free[base - 4 : base] = uncertain
     known = np.zeros((4, 4))
-    inside = np.ix_(uncertain - base + 4, uncertain - base + 4)
-    known[inside] = np.linalg.inv(intrinsics_covariance[inside])
-    return Joined(cameras, *_covariances(information, cameras, np.sort(np.concatenate([at, uncertain])), known, added))
+    known[np.ix_(uncertain, uncertain)] = np.linalg.inv(intrinsics_covariance[np.ix_(uncertain, uncertain)])
+    return Joined(cameras, *joined_covariances(information, cameras, free, known, added))
 
 
 def _moved(cameras: Cameras, step: FloatArray) -> Cameras:
     frames = step[:-4].reshape(-1, FRAME)
     poses = se3.orthonormalize(se3.retract(cameras.world_T_cam, frames[:, :6]))
     return Cameras(poses, cameras.intrinsics + step[-4:], cameras.log_scale + frames[:, 6])
-
-
-def _entries(part: WindowInformation, block: FloatArray, num_frames: int) -> Entries:
-    """Return the entries of a window's block among those of all frames."""
-    place = part.columns(num_frames)
-    return np.repeat(place, len(place)), np.tile(place, len(place)), block.reshape(-1)
-
-
-def _factorize(entries: list[Entries], size: int, at: IntArray) -> scipy.sparse.linalg.SuperLU:
-    rows, columns, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
-    matrix = scipy.sparse.csc_matrix((values, (rows, columns)), shape=(size, size))[at][:, at].tocsc()
-    try:
-        return scipy.sparse.linalg.splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-    except RuntimeError as error:
-        raise SolverError(
-            "joining windows: the windows do not determine every camera; use longer windows or a wider overlap"
-        ) from error
-
-
-def _covariances(
-    information: list[WindowInformation],
-    cameras: Cameras,
-    at: IntArray,
-    known: FloatArray,
-    added: AddedTerms | None,
-) -> tuple[FloatArray, FloatArray]:
-    """Return pose (T, 6, 6) and intrinsics (4, 4) covariances; see :mod:`uni4d_fg.optim.cluster_robust`.
-
-    The sum over clusters, over factors without landmarks, and over all as if they were independent, is taken through
-    one solve per cluster and one per direction in which a window's factors, or an added one, know anything.
-    """
-    num_frames = len(cameras.world_T_cam)
-    base = FRAME * num_frames + 4
-    size = base if added is None else added.size
-    jacobians = [part.difference(cameras)[1] for part in information]
-    curvatures = [j.T @ part.curvature @ j for part, j in zip(information, jacobians, strict=True)]
-    curvatures[0][-4:, -4:] += known
-    entries = [_entries(part, block, num_frames) for part, block in zip(information, curvatures, strict=True)]
-    if added is not None:
-        entries += added.linearize(cameras)[1]
-    solver = _factorize(entries, size, at)
-
-    def solutions(sides: FloatArray) -> FloatArray:
-        """Return the solutions of (m, size) right-hand sides."""
-        solved = np.zeros_like(sides)
-        solved[:, at] = solver.solve(np.ascontiguousarray(sides[:, at].T)).T
-        return solved[:, :base]
-
-    spreads = [part.spread for part in information]
-    scores = None
-    if all(spread is not None for spread in spreads):
-        count = max(len(spread.scores) for spread in spreads if spread is not None)
-        scores = np.zeros((count, size))
-        for part, j in zip(information, jacobians, strict=True):
-            assert part.spread is not None
-            scores[:, part.columns(num_frames)] += part.spread.scores @ j
-        used = int(np.any(scores != 0.0, axis=1).sum())
-        scores = np.sqrt(used / (used - 1.0)) * scores if used >= MIN_CLUSTERS else None
-    rest, model = _Squares(num_frames), _Squares(num_frames)
-    calibrated = np.zeros((4, size))
-    calibrated[:, base - 4 : base] = _root(known)
-    for sum_of in (rest, model):
-        sum_of.add(solutions(calibrated))
-    for part, j in zip(information, jacobians, strict=True):
-        model.add(solutions(_sides(part, part.curvature, j, num_frames, size)))
-        if scores is not None and part.spread is not None:
-            rest.add(solutions(_sides(part, part.spread.rest, j, num_frames, size)))
-    for sides in () if added is None else added.root_rows(cameras):
-        rest.add(solutions(sides))
-        model.add(solutions(sides))
-    if scores is None:
-        return model.poses, model.intrinsics
-    influence, clusters = solutions(scores), _Squares(num_frames)
-    clusters.add(influence)
-    weights = blend(_twists(influence, num_frames), model.poses, rest.poses)
-    return (
-        weights.clusters * clusters.poses + weights.model * (model.poses - rest.poses) + rest.poses,
-        weights.clusters * clusters.intrinsics + weights.model * (model.intrinsics - rest.intrinsics) + rest.intrinsics,
-    )
-
-
-class _Squares:
-    """Sums of squares of solutions: marginal covariances of every pose and of the intrinsics."""
-
-    def __init__(self, num_frames: int) -> None:
-        self.poses, self.intrinsics = np.zeros((num_frames, 6, 6)), np.zeros((4, 4))
-
-    def add(self, solved: FloatArray) -> None:
-        """Add the outer products of solutions (m, 7 T + 4)."""
-        twists = _twists(solved, len(self.poses))
-        self.poses += np.einsum("mti,mtj->tij", twists, twists, optimize=True)
-        self.intrinsics += solved[:, -4:].T @ solved[:, -4:]
-
-
-def _twists(solved: FloatArray, num_frames: int) -> FloatArray:
-    """Return the poses' part (m, T, 6) of solutions (m, 7 T + 4)."""
-    return solved[:, :-4].reshape(len(solved), num_frames, FRAME)[:, :, :6]
-
-
-def _sides(part: WindowInformation, matrix: FloatArray, jacobian: FloatArray, num_frames: int, size: int) -> FloatArray:
-    """Return rows (m, size) whose squares are a window's matrix on the shared cameras."""
-    sides = np.zeros((len(matrix), size))
-    sides[:, part.columns(num_frames)] = _root(matrix) @ jacobian
-    return sides[np.any(sides != 0.0, axis=1)]
-
-
-def _root(matrix: FloatArray) -> FloatArray:
-    """Return R with ``R^T R = matrix`` for a symmetric one without negative directions."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / scale[:, None] / scale)
-    values = np.where(values > 1e-12 * max(float(values[-1]), 1e-300), values, 0.0)
-    result: FloatArray = np.sqrt(values)[:, None] * vectors.T * scale
-    return result

@@ -39,7 +39,7 @@ from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
 from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import landmark_errors, spatial_inliers
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
-from uni4d_fg.slam.windows.join import WindowInformation
+from uni4d_fg.slam.windows.information import WindowInformation
 from uni4d_fg.slam.windows.numbered import NumberedRunner
 from uni4d_fg.slam.windows.plan import (
     TrackSpans,
