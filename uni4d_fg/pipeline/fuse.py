@@ -30,6 +30,7 @@ from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.cue_error import affine_log_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
+from uni4d_fg.results.fusion.mask_band import looks_moving
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize, working_frame
@@ -323,7 +324,13 @@ class DenseMaps:
             if measured is not None and self.bleeding_px == 0:
                 measured = without_edges(measured, cue)
             known = known_depth(measured, uv, log_z, static, cue.shape)
-            fused = fuse_static(cue, measured, known, errors.cue, log_scale, self.config)
+            bleeding_px = self.bleeding_px or 0.0
+            like_moving = np.zeros_like(static)
+            if bleeding_px > 0 and not static.all():
+                like_moving = looks_moving(self.sequence.images[frame], self.sequence.masks[frame], static)
+            fused = fuse_static(
+                cue, measured, known, errors.cue, static, like_moving, log_scale, bleeding_px, self.config
+            )
             if measured is not None and self.bleeding_px is None:
                 affine = affine_log_depth(cue, fused.corrected.scale, fused.corrected.shift)
                 bled = bleeding_radius(affine, np.log(measured.depth), static & (measured.confidence > _SURE))

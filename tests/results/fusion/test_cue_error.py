@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.results.fusion.bleeding import from_nearest
 from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.cue_error import KnownDepth, correct_cue, fit_affine
 from uni4d_fg.results.fusion.densify import ControlPoints
@@ -13,6 +14,7 @@ from uni4d_fg.results.fusion.multiview.measured import Measured
 from uni4d_fg.results.fusion.static_depth import fuse_static, held_out_errors, known_depth, without_edges
 
 HEIGHT, WIDTH = 60, 80
+NOWHERE = np.zeros((HEIGHT, WIDTH), bool)
 
 
 def room(rng: np.random.Generator, scale: float = 1.2, shift: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
@@ -97,7 +99,7 @@ def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(
         assert (ratio < 0.8) is better, ratio
     found = held_out_errors(noisy, None, uv, log_z, static, 0.0, FusionConfig())
     known = known_depth(None, uv, log_z, static, (HEIGHT, WIDTH))
-    fused = fuse_static(noisy, None, known, found.cue, 0.0, FusionConfig())
+    fused = fuse_static(noisy, None, known, found.cue, static, NOWHERE, 0.0, 0.0, FusionConfig())
     true_error = float(np.abs(fused.log_depth - truth).mean())
     assert 1 / 1.5 < float(fused.error.mean()) / true_error < 1.5
 
@@ -114,7 +116,7 @@ def test_matched_depth_that_is_sure_wins_over_a_cue_that_is_wrong_and_says_so(rn
     places = np.argwhere(rng.random(depth.shape) < 0.1)
     uv, log_z = places[:, ::-1].astype(np.float64), truth[places[:, 0], places[:, 1]].astype(np.float64)
     known = known_depth(measured, uv, log_z, np.ones(depth.shape, bool), (HEIGHT, WIDTH))
-    fused = fuse_static(bled, measured, known, 0.02, 0.0, FusionConfig())
+    fused = fuse_static(bled, measured, known, 0.02, ~NOWHERE, NOWHERE, 0.0, 0.0, FusionConfig())
     error = np.abs(fused.log_depth - truth)
     assert error[20:30, 30:50].mean() < 0.02
     chosen = fused.confidence > 0.9
@@ -140,7 +142,39 @@ def test_matched_depth_leaves_the_edges_to_a_cue_that_has_them(rng: np.random.Ge
     uv, log_z = places[:, ::-1].astype(np.float64), np.log(depth[places[:, 0], places[:, 1]]).astype(np.float64)
     for name, matched in (("as it is", measured), ("without edges", said)):
         known = known_depth(matched, uv, log_z, np.ones(depth.shape, bool), (HEIGHT, WIDTH))
-        fused = fuse_static(cue, matched, known, 0.01, 0.0, FusionConfig())
+        fused = fuse_static(cue, matched, known, 0.01, ~NOWHERE, NOWHERE, 0.0, 0.0, FusionConfig())
         errors[name] = float(np.abs(fused.log_depth - np.log(depth))[beside].mean())
     assert errors["without edges"] < 0.015
     assert errors["without edges"] < errors["as it is"]
+
+
+def test_what_a_cue_mixes_is_taken_from_matching_or_the_nearest_sure_surface(rng: np.random.Generator) -> None:
+    """A step from 2 to 3 m that the cue has blurred; matching has it, but for a strip beside it."""
+    depth = np.where(np.arange(WIDTH) < 40, 2.0, 3.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
+    cue = cv2.GaussianBlur(depth, (0, 0), 3.0)
+    sure = np.full(depth.shape, 0.97, np.float32)
+    sure[:, 41:44] = 0.2
+    seen = np.where(sure > 0.5, depth, np.float32(5.0)).astype(np.float32)
+    measured = Measured(seen, sure, np.full(depth.shape, 0.004, np.float32))
+    places = np.argwhere((rng.random(depth.shape) < 0.2) & (np.abs(np.arange(WIDTH) - 40) > 8))
+    uv, log_z = places[:, ::-1].astype(np.float64), np.log(depth[places[:, 0], places[:, 1]]).astype(np.float64)
+    known = known_depth(measured, uv, log_z, ~NOWHERE, (HEIGHT, WIDTH))
+    errors, told = {}, {}
+    for bleeding_px in (0.0, 6.0):
+        fused = fuse_static(cue, measured, known, 0.01, ~NOWHERE, NOWHERE, 0.0, bleeding_px, FusionConfig())
+        errors[bleeding_px] = np.abs(fused.log_depth - np.log(depth))[:, 35:45]
+        told[bleeding_px] = fused.confidence[:, 41:44]
+    assert errors[6.0].max() < 0.02
+    assert errors[0.0].max() > 0.1
+    assert (told[6.0] <= 0.5).all()
+    moving = np.zeros_like(NOWHERE)
+    moving[:, 41:44] = True
+    kept = fuse_static(cue, measured, known, 0.01, ~moving, moving, 0.0, 6.0, FusionConfig())
+    np.testing.assert_array_less(0.05, np.abs(kept.log_depth - np.log(depth))[:, 41:43])
+
+
+def test_a_map_is_filled_from_the_nearest_known_pixel() -> None:
+    values = np.array([[1.0, 9.0, 9.0, 2.0]], np.float32)
+    known = np.array([[True, False, False, True]])
+    np.testing.assert_array_equal(from_nearest(values, known), [[1.0, 1.0, 2.0, 2.0]])
+    np.testing.assert_array_equal(from_nearest(values, ~(known | True)), values)

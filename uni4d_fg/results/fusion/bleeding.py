@@ -1,4 +1,4 @@
-"""How far a depth cue bleeds across edges, measured against depth whose edges are where they should be."""
+"""A depth cue that bleeds across edges: how far it does, where its depth is a mixture, and what takes its place."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ _ENDS = 0.15
 _LEAST = 0.02
 """Less beside the edge is none."""
 _MIN_PIXELS = 30
+_FARTHEST_MIXED = 5.0
+"""The mixture is wrong nearer to an edge than this, working px; what bleeds farther is right to some percent."""
+_RAMP = 0.12
+"""Change of log depth across which a cue that bleeds is a mixture."""
 
 
 def bleeding_radius(log_cue: Float32Array, log_depth: Float32Array, sure: BoolArray) -> float:
@@ -52,3 +56,37 @@ def bleeding_radius(log_cue: Float32Array, log_depth: Float32Array, sure: BoolAr
         return 0.0
     below = np.flatnonzero(profile < max(_ENDS * peak, 0.5 * _LEAST))
     return float(below[0] if len(below) else reach)
+
+
+def across_edges(log_cue: Float32Array, radius_px: float) -> BoolArray:
+    """Return where a cue that bleeds mixes two surfaces, (h, w).
+
+    Args:
+        log_cue: (h, w), NaN where missing.
+        radius_px: How far it bleeds, working px.
+    """
+    side = 2 * round(min(radius_px, _FARTHEST_MIXED)) + 1
+    window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    known = np.isfinite(log_cue)
+    farthest = cv2.dilate(np.where(known, log_cue, np.float32(-np.inf)), window)
+    nearest = cv2.erode(np.where(known, log_cue, np.float32(np.inf)), window)
+    return np.asarray(farthest - nearest > _RAMP)
+
+
+def from_nearest(values: Float32Array, known: BoolArray) -> Float32Array:
+    """Return a map (h, w) in which every pixel that is not known has the value of the nearest one that is.
+
+    Nothing is averaged: between two surfaces there is no third one.
+
+    Args:
+        values: (h, w).
+        known: (h, w).
+    """
+    if known.all() or not known.any():
+        return values
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    value_of = np.zeros(int(labels.max()) + 1, dtype=np.float32)
+    value_of[labels[known]] = values[known]
+    return np.asarray(value_of[labels])

@@ -11,6 +11,7 @@ from scipy.special import erf
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.results.fusion.bleeding import across_edges, from_nearest
 from uni4d_fg.results.fusion.cue_error import CorrectedCue, KnownDepth, correct_cue
 from uni4d_fg.results.fusion.multiview.measured import Measured
 
@@ -52,6 +53,10 @@ _EDGE = 0.1
 _LEAST_SIGMA = 0.003
 _UNCOMPARED_SIGMA = 0.1
 """Of a cue that nothing can be compared with."""
+_MIXED_RIGHT = 0.05
+"""Probability that a cue is right where it mixes two surfaces."""
+_FILLED_RIGHT = 0.5
+"""Probability that the nearest sure surface is the right one."""
 _JUDGES = 0.5
 """Matched depth that is less reliable does not judge the cue."""
 
@@ -134,7 +139,10 @@ def fuse_static(
     measured: Measured | None,
     known: Known,
     cue_error: float,
+    static: BoolArray,
+    like_moving: BoolArray,
     default_log_scale: float,
+    bleeding_px: float,
     config: FusionConfig,
 ) -> StaticDepth:
     """Weigh the corrected cue and the depth from several views by their precision.
@@ -144,7 +152,11 @@ def fuse_static(
         measured: Depth from several views, if there is any.
         known: What the cue is corrected by.
         cue_error: Mean error of the corrected log cue, as held-out landmarks tell; NaN where they do not.
+        static: (h, w) where nothing moves.
+        like_moving: (h, w) what looks like a moving thing beside its mask.
         default_log_scale: Of the frame, where next to nothing is known.
+        bleeding_px: How far the cue bleeds across edges, working px: what it mixes is left to matching, and to the
+            nearest surface that is sure where matching says nothing.
         config: Fusion.
     """
     shape = known.depth.weight.shape
@@ -158,6 +170,10 @@ def fuse_static(
         return StaticDepth(corrected.log_depth, sigma, error, sure.astype(np.float32), corrected, np.zeros_like(sigma))
     cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
     has_cue = np.isfinite(corrected.log_depth)
+    mixed = np.zeros(shape, dtype=bool)
+    if bleeding_px > 0:
+        mixed = across_edges(corrected.log_depth, bleeding_px) & ~like_moving
+        cue_right = np.where(mixed, np.minimum(cue_right, _MIXED_RIGHT), cue_right)
     seen = np.log(measured.depth)
     p = np.clip(known.reliability * measured.confidence, 1e-3, 1 - 1e-3)
     difference = np.where(has_cue, seen - np.where(has_cue, corrected.log_depth, 0), 0)
@@ -170,11 +186,14 @@ def fuse_static(
     gain = np.where(both > np.maximum(match_alone, cue_alone), gain, match_alone > cue_alone)
     gain = np.where(has_cue, gain, 1.0)
     log_depth = np.where(has_cue, np.where(has_cue, corrected.log_depth, 0) + gain * difference, seen)
+    filled = mixed & (p < _SURE)
+    log_depth = np.where(filled, from_nearest(log_depth.astype(np.float32), static & ~filled), log_depth)
     sigma = np.hypot((1 - gain) * cue_sigma, gain * matched)
     # What the explanation that was chosen has of all, and the depth of the others would be wrong.
     chosen = np.maximum(both, np.maximum(match_alone, cue_alone))
     neither = (1 - p) * (1 - cue_right) * _normal(difference, np.full_like(difference, 2 * _WRONG_SIGMA**2))
     share = np.where(has_cue, chosen / (both + match_alone + cue_alone + neither), p)
+    share[filled] = _FILLED_RIGHT
     sure = share * _within(sigma)
     error = share * sigma / _MEAN_TO_SIGMA + (1 - share) * _WRONG_ERROR
     return StaticDepth(
