@@ -1,11 +1,12 @@
 """How much faster worker processes are than one after the other: windows of one long video, and many videos.
 
     python benchmarks/workers.py windows --frames 1000 --workers 2
-    python benchmarks/workers.py videos --count 10 --workers 4
+    python benchmarks/workers.py videos --count 10 --workers 4 --size 320x240
 
-Both ways have one thread per task and end in the same bytes, which is checked. Wall time says something only on a
-machine that does nothing else. Elsewhere the CPU time says what it would be: that of this process, which mostly waits,
-and that of the busiest worker, or of all workers over the cores, whichever is more.
+A worker takes some seconds of a core to start, so that videos that are done in less gain nothing. Both ways have one
+thread per task and end in the same bytes, which is checked. Wall time says something only on a machine that does
+nothing else. Elsewhere the CPU time says what it would be: that of this process, which mostly waits, and that of the
+busiest worker, or of all workers over the cores, whichever is more.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("what", choices=("windows", "videos"))
     parser.add_argument("--frames", type=int, help="of a video; 1000 for windows, 24 for videos")
     parser.add_argument("--count", type=int, default=10, help="videos")
+    parser.add_argument("--size", default="160x120", help="of the images, width x height, px")
     parser.add_argument("--window", type=int, default=100, help="frames of a window")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--root", type=Path, help="folder of the scenes, kept; else a temporary one")
@@ -52,7 +54,8 @@ def main() -> None:
         folder = Path(name)
         frames = asked.frames or (1000 if asked.what == "windows" else 24)
         count = 1 if asked.what == "windows" else asked.count
-        root = make_scenes(asked.root or folder / "scenes", count, frames)
+        width, height = map(int, asked.size.split("x"))
+        root = make_scenes(asked.root or folder / "scenes", count, frames, (height, width))
         run = windows if asked.what == "windows" else videos
         both = {}
         for workers in (1, asked.workers):
@@ -69,13 +72,14 @@ def main() -> None:
         compare(folder / "1", folder / f"{asked.workers}")
 
 
-def make_scenes(root: Path, count: int, frames: int) -> Path:
-    """Make small scenes with given tracks where they are not there yet."""
+def make_scenes(root: Path, count: int, frames: int, size: tuple[int, int]) -> Path:
+    """Make scenes with given tracks where they are not there yet; more tracks in larger images."""
+    height, width = size
     for number in range(count):
         if not (root / f"scene_{number}").exists():
             scene = SyntheticSceneConfig(
-                num_frames=frames, height=120, width=160, focal=150.0, margin_px=3.0, grid_columns=16, grid_rows=12,
-                query_interval=10, frame_rate=30.0, seed=number,
+                num_frames=frames, height=height, width=width, focal=width * 15 / 16, margin_px=3.0,
+                grid_columns=width // 10, grid_rows=height // 10, query_interval=10, frame_rate=30.0, seed=number,
             )  # fmt: skip
             write_native(make_synthetic_sequence(scene), root / f"scene_{number}")
     return root

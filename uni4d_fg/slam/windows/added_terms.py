@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
@@ -24,13 +23,8 @@ from uni4d_fg.optim.added_factors import AddingRunner, JoinedStage
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.slam.stages.scene import Cameras
+from uni4d_fg.slam.windows.fronts import Entries
 from uni4d_fg.slam.windows.information import FRAME
-
-_ROWS = 600
-"""Rows of right-hand sides at a time."""
-
-Entries: TypeAlias = tuple[IntArray, IntArray, FloatArray]
-"""Rows, columns and values of some entries of a matrix."""
 
 
 @dataclass
@@ -104,20 +98,6 @@ class AddedTerms:
                     column = np.broadcast_to(columns[:, None, :], block.shape)
                     entries.append((row.reshape(-1), column.reshape(-1), block.reshape(-1)))
         return gradient, entries
-
-    def root_rows(self, cameras: Cameras) -> Iterator[FloatArray]:
-        """Yield rows (m, size) of a square root of the Hessian."""
-        for r, slots in self._rows(cameras):
-            count, dim = r.shape
-            step = max(1, _ROWS // dim)
-            for start in range(0, count, step):
-                part = np.arange(start, min(start + step, count))
-                out = np.zeros((len(part), dim, self.size))
-                for columns, jacobian in slots:
-                    at = np.broadcast_to(columns[part][:, None, :], jacobian[part].shape)
-                    place = np.arange(len(part))[:, None, None], np.arange(dim)[None, :, None], at
-                    np.add.at(out, place, jacobian[part])
-                yield out.reshape(-1, self.size)
 
     def move(self, step: FloatArray) -> None:
         """Move the added variables along a step (size,)."""

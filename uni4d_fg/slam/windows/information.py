@@ -14,8 +14,9 @@ from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.plan import Window
 
 FRAME = 7
-"""Columns per frame: twist, log-scale. The intrinsics' four follow, and then those of added variables."""
-UNDETERMINED = "joining windows: the windows do not determine every camera; use longer windows or a wider overlap"
+"""Columns per frame: twist, log-scale."""
+SHARED = 4
+"""Columns after those of all frames: the intrinsics. Those of added variables follow."""
 
 
 @dataclass(frozen=True)

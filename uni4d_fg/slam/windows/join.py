@@ -24,11 +24,10 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.se3 import se3_log
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.added_terms import AddedTerms
-from uni4d_fg.slam.windows.fronts import FrontChain
-from uni4d_fg.slam.windows.information import FRAME, WindowInformation
+from uni4d_fg.slam.windows.fronts import Entries, FrontChain
+from uni4d_fg.slam.windows.information import FRAME, SHARED, WindowInformation
 from uni4d_fg.slam.windows.join_covariance import joined_covariances
 from uni4d_fg.slam.windows.plan import Window
-from uni4d_fg.slam.windows.sparse_sum import SparseSum
 
 _STEP_SIZE = 1e-9
 """A Gauss-Newton step below this ends the solve (rad, m, log)."""
@@ -92,24 +91,22 @@ def join(
         SolverError: If the windows do not determine a camera.
     """
     cameras, num_frames = start, len(start.world_T_cam)
-    base = FRAME * num_frames + 4
+    base = FRAME * num_frames + SHARED
     free = np.ones(base, dtype=bool) if added is None else added.free
     if added is None:
         free[:6] = False
-    free[base - 4 : base] = False
+    free[base - SHARED : base] = False
     for _ in range(_MAX_STEPS if added is None else _MAX_STEPS_ADDED):
         gradient, matrices = np.zeros(len(free)), []
         for part in information:
             d, jacobian = part.difference(cameras)
             matrices.append(jacobian.T @ part.hessian @ jacobian)
             gradient[part.columns(num_frames)] += jacobian.T @ (part.hessian @ d + part.gradient)
-        solver: FrontChain | SparseSum
-        if added is None:
-            solver = FrontChain([part.window for part in information], matrices, free, FRAME)
-        else:
+        entries: list[Entries] = []
+        if added is not None:
             slope, entries = added.linearize(cameras)
             gradient += slope
-            solver = SparseSum(information, matrices, entries, free)
+        solver = FrontChain([part.window for part in information], matrices, free, FRAME, SHARED, entries)
         step = -solver.solve(gradient[None])[0]
         if not np.isfinite(step).all():
             raise SolverError("joining windows: a step is not finite; use longer windows or a wider overlap")
@@ -121,7 +118,7 @@ def join(
     if not covariance:
         return Joined(cameras, np.full((num_frames, 6, 6), np.nan), np.full((4, 4), np.nan))
     uncertain = np.diag(intrinsics_covariance) > 0
-    free[base - 4 : base] = uncertain
+    free[base - SHARED : base] = uncertain
     known = np.zeros((4, 4))
     known[np.ix_(uncertain, uncertain)] = np.linalg.inv(intrinsics_covariance[np.ix_(uncertain, uncertain)])
     return Joined(cameras, *joined_covariances(information, cameras, free, known, added))
