@@ -27,6 +27,7 @@ class FormatChoice(str, Enum):
     ply = "ply"
     ply_frames = "ply-frames"
     mesh = "mesh"
+    exr = "exr"
     glb = "glb"
     rrd = "rrd"
     uni4d = "uni4d"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,42 @@ def test_the_file_holds_no_empty_lists(scene: Scene) -> None:
     # What follows the header of 12 bytes and that of the first chunk, 8, is JSON.
     data = scene.path.read_bytes()
     check(json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")]))
+
+
+def test_the_container_keeps_the_rules_of_the_format(scene: Scene) -> None:
+    # Read without the library that wrote it (glTF 2.0, section 4.4): a header, a chunk of JSON, a chunk of bytes.
+    data = scene.path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert (kind, size % 4) == (b"JSON", 0)
+    text = data[20 : 20 + size]
+    assert text.rstrip(b" ").endswith(b"}")
+    bytes_size, bytes_kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert (bytes_kind, bytes_size % 4, 28 + size + bytes_size) == (b"BIN\0", 0, len(data))
+    file = json.loads(text)
+    assert 0 <= bytes_size - file["buffers"][0]["byteLength"] <= 3
+    ends = 0
+    for view in file["bufferViews"]:
+        # Views lie one behind the other, and on multiples of four.
+        assert ends <= view["byteOffset"] <= ends + 3
+        ends = view["byteOffset"] + view["byteLength"]
+    assert ends <= file["buffers"][0]["byteLength"]
+
+
+def test_every_animation_has_growing_times_and_a_value_for_each(scene: Scene) -> None:
+    (animation,) = scene.file.animations
+    for channel in animation.channels:
+        sampler = animation.samplers[channel.sampler]
+        times, values = scene.array(sampler.input)[:, 0], scene.array(sampler.output)
+        node = scene.file.nodes[channel.target.node]
+        assert times[0] >= 0.0
+        assert (np.diff(times) > 0.0).all()
+        assert len(scene.file.accessors[sampler.input].min) == 1
+        targets = len(scene.file.meshes[node.mesh].primitives[0].targets) if channel.target.path == "weights" else 1
+        assert len(values) == len(times) * targets
+        if channel.target.path == "rotation":
+            np.testing.assert_allclose(np.linalg.norm(values, axis=1), 1.0, atol=1e-6)
 
 
 def test_everything_hangs_below_a_node_that_puts_y_up(scene: Scene) -> None:

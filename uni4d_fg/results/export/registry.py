@@ -5,6 +5,7 @@ from __future__ import annotations
 from uni4d_fg.errors import InputError
 from uni4d_fg.optional import import_open3d, import_pygltflib, import_rerun
 from uni4d_fg.results.export.colmap import write_colmap
+from uni4d_fg.results.export.exr import write_exr_depth
 from uni4d_fg.results.export.glb import write_glb
 from uni4d_fg.results.export.gsplat import write_gsplat
 from uni4d_fg.results.export.mesh import write_mesh
@@ -25,6 +26,7 @@ FORMATS: dict[str, Exporter] = {
     "ply": Exporter(write_ply_folder, has_lens=True, require=import_open3d),
     "ply-frames": Exporter(write_ply_frames, needs_images=True, require=import_open3d),
     "mesh": Exporter(write_mesh, needs_images=True, require=import_open3d),
+    "exr": Exporter(write_exr_depth, needs_images=True, has_lens=True),
     "glb": Exporter(write_glb, has_lens=True, require=import_pygltflib),
     "rrd": Exporter(write_rrd, needs_images=True, require=import_rerun),
     "uni4d": Exporter(write_uni4d_results, needs_images=True, require=import_open3d),
