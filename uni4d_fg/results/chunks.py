@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
 
 CHUNK_POINTS = 40_000
+_MOST_CHUNKS = 32
+"""Of a large cloud, whose chunks have more points: a browser takes time for each, however little of it is drawn."""
 _SPACING_SAMPLES = 400
 _TOUCHING = 1.6
 """Diameter over the spacing of points, at which a surface has no holes."""
@@ -34,13 +36,14 @@ class Chunk:
     """Size of a point at which neighbors touch, meters."""
 
 
-def chunks_of(points: FloatArray | Float32Array, limit: int = CHUNK_POINTS) -> Iterator[Chunk]:
+def chunks_of(points: FloatArray | Float32Array, limit: int | None = None) -> Iterator[Chunk]:
     """Split a cloud in halves, along the longest side, until no part has more than ``limit`` points.
 
     Args:
         points: (N, 3) world positions, meters, finite.
-        limit: Most points of a chunk.
+        limit: Most points of a chunk; :data:`CHUNK_POINTS`, more in a large cloud, if None.
     """
+    limit = limit or max(CHUNK_POINTS, -(-len(points) // _MOST_CHUNKS))
     waiting = [np.arange(len(points))] if len(points) else []
     while waiting:
         rows = waiting.pop()

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from viewing_samples import NUM_FRAMES, copied, opened
 
 from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.results import chunks as chunks_module
 from uni4d_fg.results.chunks import chunks_of, even_order, spacing_of
 from uni4d_fg.results.clouds import read_ply
 from uni4d_fg.results.colors import (
@@ -109,6 +110,17 @@ def test_chunks_hold_every_point_once_in_its_place(count: int, limit: int, seed:
         back = chunk.center + chunk.radius * chunk.points.astype(np.float64)
         assert np.abs(back - points[chunk.rows]).max() <= 0.501 * chunk.radius / 1024
     assert list(chunks_of(np.zeros((0, 3)))) == []
+
+
+def test_a_large_cloud_has_no_more_chunks_than_a_browser_likes(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunks_module, "CHUNK_POINTS", 100)
+    monkeypatch.setattr(chunks_module, "_MOST_CHUNKS", 8)
+    for count, chunks in ((90, 1), (400, 4), (700, 8), (5000, 8)):
+        found = list(chunks_of(rng.random((count, 3))))
+        assert len(found) == chunks
+        assert sum(len(chunk.rows) for chunk in found) == count
 
 
 def test_any_first_part_of_a_chunk_covers_it() -> None:

@@ -7,7 +7,7 @@
 // drawn, up to what takes most of a second. Where a name that this relies on is not found, everything is drawn.
 (() => {
   if (window.uni4dDetail || !window.WebGL2RenderingContext) return;
-  const TARGET_MS = 38, TOUCH_MS = 300, STILL_FACTOR = 6, STILL_MOST = 20, FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24;
+  const TARGET_MS = 43, TOUCH_MS = 300, QUIET_MS = 800, STILL_FACTOR = 6, STILL_MOST = 20, FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24;
   const state = (window.uni4dDetail = { budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false });
   // Without a graphics card, smoothing of edges costs more than everything else; points have none.
   let software = null;
@@ -27,7 +27,8 @@
   const gl2 = WebGL2RenderingContext.prototype;
   const NAMES = ["scale", "modelViewMatrix", "projectionMatrix"];
   const located = new WeakMap(), values = new WeakMap();
-  let program = null, still = 0, asked = 0, shown = 0, moving = false, begun = false, before = 0, drewBefore = false, touched = -1e9;
+  let program = null, still = 0, asked = 0, shown = 0, moving = false, begun = false, before = 0, drewBefore = false;
+  let touched = -1e9, last = -1e9, answered = true;
 
   const wrap = (name, make) => { const inner = gl2[name]; gl2[name] = make(inner); return inner; };
   wrap("useProgram", (inner) => function (next) { program = next; return inner.call(this, next); });
@@ -64,9 +65,11 @@
     if (!scale || !view || !projection) return inner.call(this, mode, first, count);
     if (!begun) {
       begun = true;
-      // viser draws once a second when nothing changes, and frame after frame when something does.
-      moving = drewBefore || performance.now() - touched < TOUCH_MS;
+      // viser draws once a second when nothing changes, and more often when something does: by hand, or as the time goes on.
+      const now = performance.now();
+      moving = drewBefore || !answered || now - touched < TOUCH_MS || now - last < QUIET_MS;
       still = moving ? 0 : still + 1;
+      last = now; answered = true;
     }
     const part = worth(view, projection, scale);
     if (part === 0) return;
@@ -83,13 +86,16 @@
     setNumber.call(this, places.scale, scale);
   });
 
-  for (const kind of ["pointerdown", "pointermove", "wheel"])
-    window.addEventListener(kind, (event) => { if (event.buttons || kind === "wheel") touched = performance.now(); }, true);
+  for (const kind of ["pointerdown", "pointermove", "wheel", "keydown"])
+    window.addEventListener(kind, (event) => {
+      if (!event.buttons && kind.startsWith("pointer")) return;
+      touched = performance.now(); answered = false;
+    }, true);
   const tick = (now) => {
     const drew = begun;
     if (drew) {
       state.wanted = asked; state.drawn = shown; state.frames += 1;
-      asked = shown = 0; begun = false;
+      asked = shown = 0;
       if (drewBefore && moving) {
         state.milliseconds += 0.3 * (Math.min(now - before, 500) - state.milliseconds);
         const ratio = TARGET_MS / Math.max(state.milliseconds, 1);
@@ -97,6 +103,7 @@
         state.budget = Math.min(Math.max(state.budget, FEWEST), MOST);
       }
     }
+    begun = false;
     drewBefore = drew; before = now;
     requestAnimationFrame(tick);
   };
