@@ -9,7 +9,10 @@ from uni4d_fg.config.solver import KernelConfig
 
 
 class LoopsConfig(Section):
-    """Places that come into sight again after they were out of sight, as relative poses in bundle adjustment."""
+    """Places that come into sight again after they were out of sight, as relative poses in bundle adjustment.
+
+    A stream looks for them at its end, and closes them on a graph of its poses.
+    """
 
     enabled: Literal["auto", "off"] = setting(
         "auto",

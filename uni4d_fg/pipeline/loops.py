@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import INTRINSICS, LOG_SCALE, POSE
 from uni4d_fg.frontend.sequence.model import Sequence
-from uni4d_fg.pipeline.lens import CameraModel
+from uni4d_fg.pipeline.lens import CameraModel, known_camera
 from uni4d_fg.pipeline.store import StageRecord
+from uni4d_fg.slam.incremental.results import Finished
 from uni4d_fg.slam.loops.closing import LoopClosing
+from uni4d_fg.slam.loops.pose_graph import close_path
 
 
 def loop_closing(sequence: Sequence, camera: CameraModel, config: Config) -> LoopClosing | None:
@@ -19,6 +26,29 @@ def loop_closing(sequence: Sequence, camera: CameraModel, config: Config) -> Loo
     if config.loops.enabled == "off" or not may or sequence.num_frames <= config.loops.min_gap:
         return None
     return LoopClosing(sequence, camera.lens, config.loops)
+
+
+def close_stream(
+    path: Finished, intrinsics: FloatArray, sequence: Sequence, config: Config
+) -> tuple[Finished, LoopClosing | None]:
+    """Return what a stream has left, with its loops closed, and the search; the path itself where there is no loop.
+
+    Args:
+        path: All frames of the sequence.
+        intrinsics: (4,) px, as the stream found them.
+        sequence: Its images, depth and masks are read again where the camera may have come back.
+        config: What is compared and believed.
+    """
+    closing = loop_closing(sequence, known_camera(sequence, config), config)
+    frames = [] if closing is None else list(path.frames())
+    # A stream takes no frame twice: numbers are those of the sequence only if it has taken all.
+    if closing is None or len(frames) != sequence.num_frames:
+        return path, None
+    poses = np.stack([frame.world_T_cam for frame in frames])
+    log_scale = np.array([[frame.log_scale] for frame in frames])
+    closing.search(State({POSE: poses, INTRINSICS: intrinsics[None], LOG_SCALE: log_scale}))
+    closed = close_path(path, poses, np.stack([frame.covariance for frame in frames]), closing)
+    return (path if closed is None else closed), closing
 
 
 def with_loops(loops: LoopClosing | None, record: StageRecord) -> StageRecord:

@@ -20,6 +20,7 @@ from uni4d_fg.pipeline.assemble import write_result
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import check_parameters
+from uni4d_fg.pipeline.loops import close_stream
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
@@ -51,7 +52,7 @@ class StreamSummary:
     bridged: int = 0
     """Frames of the result that were bridged, those of earlier processes too."""
     facts: list[str] = field(default_factory=list)
-    """What measurements there were."""
+    """Loops that were closed, and what measurements there were."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -118,7 +119,9 @@ def stream_sequence(
         measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
         sources = (*additions, *measured.sources)
         summary = _stream(sequence, run_dir, config, resume, on_frame, should_stop, sources)
-        summary = replace(summary, facts=measured.facts, doubts=[*summary.doubts, *measured.warnings])
+        summary = replace(
+            summary, facts=[*summary.facts, *measured.facts], doubts=[*summary.doubts, *measured.warnings]
+        )
         atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
         return summary
 
@@ -156,15 +159,21 @@ def _stream(
             folder.save(solver, key)
             seconds["checkpoint"] = seconds.get("checkpoint", 0.0) + time.perf_counter() - since
     folder.save(solver, key)
-    reconstruction = solver.finish()
+    solver.flush()
+    path, closing = close_stream(folder, solver.intrinsics, sequence, config)
+    reconstruction = solver.collect(path)
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began
     doubts = scene_warnings(
         sequence.intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks
     )
+    facts = []
+    if closing is not None:
+        seconds["loops"], facts = closing.seconds, closing.facts()
+        doubts += closing.warnings()
     bridged = sum(frame.status is FrameStatus.BRIDGED for frame in folder.frames())
     summary = StreamSummary(
-        sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), doubts, bridged
+        sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), doubts, bridged, facts
     )
     return summary
 

@@ -32,7 +32,7 @@ _WINDOW = (
 _OBSERVATIONS = ("track", "frame", "uv", "depth", "weight")
 _BOOK = ("track", "first_frame", "last_frame", "label", "votes", "disagreeing", "color")
 _DYNAMIC_POINTS = ("track", "instance", "point", "observed", "color")
-_LANDMARKS = ("track", "point", "error", "count", "color")
+_LANDMARKS = ("track", "point", "error", "count", "color", "keyframe")
 
 
 def state_arrays(solver: IncrementalReconstructor) -> Arrays:
@@ -147,8 +147,9 @@ def result_arrays(frames: list[FinishedFrame], landmarks: list[Landmarks]) -> Ar
     out["frames_covariance"] = np.array([f.covariance for f in frames]).reshape(-1, 6, 6)
     out |= _points_arrays("frames", [f.dynamic for f in frames])
     empty = Landmarks(
-        np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3), np.uint8)
-    )
+        np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3), np.uint8),
+        np.zeros(0, np.int64),
+    )  # fmt: skip
     for name in _LANDMARKS:
         out[f"landmarks_{name}"] = np.concatenate([getattr(part, name) for part in (empty, *landmarks)])
     return out

@@ -87,6 +87,8 @@ class Landmarks:
     """(n,) observations."""
     color: ImageArray
     """(n, 3) RGB."""
+    keyframe: IntArray
+    """(n,) frame number of the keyframe that they left the window with."""
 
 
 @dataclass(frozen=True)

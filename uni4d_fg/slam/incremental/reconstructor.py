@@ -30,7 +30,7 @@ from uni4d_fg.slam.incremental.model import (
     Landmarks,
 )
 from uni4d_fg.slam.incremental.pose import FramePose, locate, predict, refocused, shared_spread
-from uni4d_fg.slam.incremental.results import Results, ResultsInMemory, assemble_results
+from uni4d_fg.slam.incremental.results import Finished, Results, ResultsInMemory, assemble_results
 from uni4d_fg.slam.incremental.smoother import make_smoother
 from uni4d_fg.slam.incremental.tracking import OnlineTracker
 from uni4d_fg.slam.incremental.window import CameraWindow, LeftKeyframe, LeftLandmarks, no_observations
@@ -186,7 +186,7 @@ class IncrementalReconstructor:
                 with self._timed("marginalize"):
                     oldest, gone = self.window.slide()
                 left.append(oldest)
-                landmarks.append(self._colored(gone))
+                landmarks.append(self._colored(gone, oldest.frame))
         self.last_pose = self._pose_of(self.pending[-1])
         with self._timed("nonrigid"):
             dynamic = self._solve_dynamic(frame, static, moving)
@@ -203,9 +203,16 @@ class IncrementalReconstructor:
             DegenerateProblemError: If no frame was added.
         """
         self.flush()
-        return assemble_results(
-            self.results, self.window.intrinsics, self.window.intrinsics_covariance, self.image_size, self.lens
-        )
+        return self.collect(self.results)
+
+    def collect(self, results: Finished) -> Reconstruction:
+        """Return what has left the window as a :class:`Reconstruction`.
+
+        Raises:
+            DegenerateProblemError: If no frame was added.
+        """
+        window = self.window
+        return assemble_results(results, window.intrinsics, window.intrinsics_covariance, self.image_size, self.lens)
 
     def flush(self) -> None:
         """Hand over what is left in the window to ``results``; more frames may not be added."""
@@ -217,7 +224,7 @@ class IncrementalReconstructor:
         frames = [finished for row in range(len(window)) for finished in self._finish_keyframe(window.keyframe(row))]
         landmarks: tuple[Landmarks, ...] = ()
         if len(window.landmark_track):
-            landmarks = (self._colored(window.all_landmarks()),)
+            landmarks = (self._colored(window.all_landmarks(), int(window.frame[-1])),)
         self.results.add(tuple(frames), landmarks)
         self.pending = []
         self.window = CameraWindow(
@@ -417,8 +424,9 @@ class IncrementalReconstructor:
         relative = pending.covariance + shared_spread(pending.keyframe_T_cam, self.window.focal_sigma, depth)
         return se3.composed_covariance(keyframe.covariance, pending.keyframe_T_cam, relative)
 
-    def _colored(self, left: LeftLandmarks) -> Landmarks:
-        return Landmarks(left.track, left.point, left.error, left.count, self.book.colors(left.track))
+    def _colored(self, left: LeftLandmarks, keyframe: int) -> Landmarks:
+        colors = self.book.colors(left.track)
+        return Landmarks(left.track, left.point, left.error, left.count, colors, np.full(len(left.track), keyframe))
 
     def _forget(self, frame: int) -> None:
         used: list[IntArray] = [self.window.observations.track, self.dynamic.observations.track]

@@ -15,12 +15,8 @@ from uni4d_fg.slam.incremental.model import FinishedFrame, Landmarks
 from uni4d_fg.slam.reconstruction import Reconstruction
 
 
-class Results(Protocol):
-    """Takes over what leaves the window; may keep it in memory or write it."""
-
-    def add(self, frames: tuple[FinishedFrame, ...], landmarks: tuple[Landmarks, ...]) -> None:
-        """Take over finished frames, in order, and landmarks."""
-        ...
+class Finished(Protocol):
+    """What has left the window."""
 
     def frames(self) -> Iterable[FinishedFrame]:
         """Return all finished frames in order."""
@@ -28,6 +24,14 @@ class Results(Protocol):
 
     def landmarks(self) -> Iterable[Landmarks]:
         """Return all finished landmarks."""
+        ...
+
+
+class Results(Finished, Protocol):
+    """Takes over what leaves the window; may keep it in memory or write it."""
+
+    def add(self, frames: tuple[FinishedFrame, ...], landmarks: tuple[Landmarks, ...]) -> None:
+        """Take over finished frames, in order, and landmarks."""
         ...
 
 
@@ -53,7 +57,7 @@ class ResultsInMemory:
 
 
 def assemble_results(
-    results: Results, intrinsics: FloatArray, intrinsics_covariance: FloatArray, image_size: tuple[int, int],
+    results: Finished, intrinsics: FloatArray, intrinsics_covariance: FloatArray, image_size: tuple[int, int],
     lens: Lens = PINHOLE,
 ) -> Reconstruction:  # fmt: skip
     """Collect a :class:`Reconstruction`; a track whose landmark was started anew counts once, as the weighted mean.

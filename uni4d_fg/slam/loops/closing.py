@@ -58,12 +58,21 @@ class LoopClosing:
         if stage.kind != "bundle_adjustment" or stage.own_world or not everywhere:
             return None
         if self.links is None:
-            began = time.process_time()
-            self.links = find_loops(self.sequence, self.lens, state, self.config)
-            self.seconds = time.process_time() - began
+            self.search(state)
         if self.asked:
-            self._judge(state[POSE])
+            self.judge(state[POSE])
         self.asked = True
+        source = self.source()
+        return None if source is None else source(stage, state)
+
+    def search(self, state: State) -> None:
+        """Look for loops, with the cameras of all frames as solved so far."""
+        began = time.process_time()
+        self.links = find_loops(self.sequence, self.lens, state, self.config)
+        self.seconds = time.process_time() - began
+
+    def source(self) -> RelativePoseSource | None:
+        """Return what holds as factors; None where nothing does."""
         if not self.links:
             return None
         poses = RelativePoses(
@@ -72,13 +81,15 @@ class LoopClosing:
             np.stack([one.first_T_second for one in self.links]),
             np.stack([one.information for one in self.links]),
         )
-        return RelativePoseSource(poses, self.config.kernel, is_metric=False)(stage, state)
+        return RelativePoseSource(poses, self.config.kernel, is_metric=False)
 
-    def _judge(self, world_T_cam: FloatArray) -> None:
-        assert self.links is not None
-        holds = [self._sigmas(one, world_T_cam) <= self.config.let_go for one in self.links]
-        self.let_go += [one for one, good in zip(self.links, holds, strict=True) if not good]
-        self.links = [one for one, good in zip(self.links, holds, strict=True) if good]
+    def judge(self, world_T_cam: FloatArray) -> bool:
+        """Let go what solved cameras (T, 4, 4) left far away; return whether anything was."""
+        links = self.links or []
+        holds = [self._sigmas(one, world_T_cam) <= self.config.let_go for one in links]
+        self.let_go += [one for one, good in zip(links, holds, strict=True) if not good]
+        self.links = [one for one, good in zip(links, holds, strict=True) if good]
+        return not all(holds)
 
     @staticmethod
     def _sigmas(one: Link, world_T_cam: FloatArray) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from uni4d_fg.arrays import IntArray
 from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.factors.state import State
@@ -52,13 +53,17 @@ class RelativePoseSource:
         """Join bundle adjustment; None elsewhere."""
         if stage.kind != "bundle_adjustment":
             return None
-        poses, frames = self.poses, state.numbers(POSE)[:, 0]
+        factors = self.factors(state.numbers(POSE)[:, 0])
+        return Addition(factors, is_metric=self.is_metric) if factors else None
+
+    def factors(self, frames: IntArray) -> list[gtsam.BetweenFactorPose3]:
+        """Return the factors between some frames (N,)."""
+        poses = self.poses
         here = np.flatnonzero(np.isin(poses.first, frames) & np.isin(poses.second, frames))
-        factors = [
+        return [
             gtsam.BetweenFactorPose3(
                 POSE.key(int(poses.first[i])), POSE.key(int(poses.second[i])),
                 gtsam.Pose3(poses.first_T_second[i]), self.noise(poses.information[i]),
             )
             for i in here.tolist()
         ]  # fmt: skip
-        return Addition(factors, is_metric=self.is_metric) if factors else None
