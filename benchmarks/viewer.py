@@ -14,11 +14,11 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -83,8 +83,11 @@ def make_run(folder: Path, points: int, frames: int, moving: int) -> None:
 
 
 def _answers() -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", PORT)) == 0
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{PORT}"):
+            return True
+    except OSError:
+        return False
 
 
 def first_picture(page: Any, began: float) -> float:

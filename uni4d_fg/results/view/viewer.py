@@ -28,8 +28,8 @@ from uni4d_fg.results.view.static_layer import FIRST_POINTS, StaticLayer
 CAMERA_SIZE = 0.035
 """Size of the current camera, in parts of the scene's depth."""
 _IDLE_SECONDS = 0.03
-_PATIENCE_SECONDS, _HEAD_START_SECONDS = 10.0, 0.7
-"""What is not in the first picture waits so long for a browser, and then for the browser to draw."""
+_HEAD_START, _HEAD_START_SECONDS = 0.7, (0.7, 3.0)
+"""A browser gets this part of the time that its page took to load for drawing the first picture; least and most."""
 _STILL_SECONDS = 0.3
 """The time must stand still for so long before every pixel of a frame is sent."""
 
@@ -96,11 +96,12 @@ class Viewer:
 
     def load_when_seen(self, should_stop: Callable[[], bool] = lambda: False) -> None:
         """Do what :meth:`load` does when a browser shows the first picture, which would come later with it."""
-        deadline = time.monotonic() + _PATIENCE_SECONDS
-        while not should_stop() and time.monotonic() < deadline and not self._seen.wait(_IDLE_SECONDS):
-            pass
-        if self._seen.is_set():
-            time.sleep(_HEAD_START_SECONDS)
+        began = time.monotonic()
+        while not self._seen.wait(_IDLE_SECONDS):
+            if should_stop():
+                return
+        least, most = _HEAD_START_SECONDS
+        time.sleep(min(max(_HEAD_START * (time.monotonic() - began), least), most))
         self.load(should_stop)
 
     def load(self, should_stop: Callable[[], bool] = lambda: False) -> None:
