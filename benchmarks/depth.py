@@ -32,9 +32,10 @@ from uni4d_fg.frontend.sequence.read import read_sequence
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.pipeline.store import StageStore
+from uni4d_fg.results.clouds import read_ply
+from uni4d_fg.results.confidence_store import read_confidence
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.evaluate.protocols.consistency import score_consistency
-from uni4d_fg.results.fusion.clouds import static_cloud
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -145,11 +146,8 @@ def run_scene(name: str, sequence: Sequence, masks: FrameSource[Int32Array], wor
     broken, named = set(broken_truth(sequence.depths)), set(stage.get("broken_frames", []))
     worst = max((fused.frames[frame] for frame in broken), default=np.nan) / np.nanmedian(fused.frames)
     consistency = score_consistency(depth, masks, result.world_T_cam, result.intrinsics, lens=result.lens)
-    cloud = static_cloud(
-        sequence.images, depth, sequence.masks, result.frame_intrinsics, result.world_T_cam, config.fusion,
-        lens=result.lens,
-    )  # fmt: skip
-    off = off_surface(cloud.points, result, truth, masks, fused.scale)
+    points, _ = read_ply(folder.static_cloud)
+    off = off_surface(points, result, truth, masks, fused.scale)
     told = stage.get("depth_error", np.nan) / fused.flat
     sure = _sure(folder, depth, truth, masks, fused.scale)
     pairs = [
@@ -169,11 +167,10 @@ def _sure(
     masks: FrameSource[Int32Array], scale: float,
 ) -> str:  # fmt: skip
     """Say how many of the static pixels that are said to be sure are right."""
-    if not getattr(folder, "confidence", Path("/nonexistent")).exists():
+    if not folder.confidence.exists():
         return "-"
-    from uni4d_fg.results.confidence_store import read_confidence
-
-    confidence = read_confidence(folder.confidence)
+    height, width = np.asarray(truth[0]).shape
+    confidence = read_confidence(folder.confidence, (height, width))
     right = said = known = 0
     for frame in range(len(truth)):
         d, g, m = (np.asarray(source[frame]) for source in (depth, truth, masks))
@@ -192,7 +189,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("runs"))
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     options = parser.parse_args()
-    config = load_config("default", ["output.clouds=false", "output.pictures=false", *options.overrides])
+    config = load_config("default", ["output.pictures=false", *options.overrides])
     columns = ["scene", "flat", "away", "edge", "moving", "broken", "named", "SC", "off", "told", "sure", "fusion"]
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     for scene in options.scenes:

@@ -310,6 +310,14 @@ class FusionConfig(Section):
     edge_relative_gradient: float = setting(
         0.05, "Pixels whose depth changes by more than this part per pixel are left out of the clouds.", gt=0
     )
+    cloud_confidence: float = setting(
+        0.8,
+        "The static cloud takes pixels whose depth is right to 3 % with at least this probability, as the frames "
+        "around say; 0 takes all.",
+        ge=0,
+        le=1,
+        basic=True,
+    )
     static_stride: int = setting(4, "The static cloud takes every this many pixels in x and y.", ge=1, basic=True)
     static_frame_stride: int = setting(5, "It takes every this many frames.", ge=1)
     static_voxel_m: float = setting(0.01, "Voxel size of the static cloud, m; 0 keeps every point.", ge=0, basic=True)

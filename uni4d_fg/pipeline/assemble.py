@@ -18,6 +18,7 @@ from uni4d_fg.geometry.trajectory import Trajectory
 from uni4d_fg.pipeline.leftovers import remove_views
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.clouds import write_clouds
+from uni4d_fg.results.confidence_store import read_confidence
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.fusion.clouds import dynamic_cloud, dynamic_clouds, static_cloud
 from uni4d_fg.results.io import save_reconstruction
@@ -94,7 +95,12 @@ def write_views(
         return
     depth = read_depth(folder.depth)
     intrinsics, poses, lens = reconstruction.frame_intrinsics, reconstruction.world_T_cam, reconstruction.lens
-    static = static_cloud(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, lens=lens)
+    sure = None
+    if config.fusion.static == "field":
+        sure = read_confidence(folder.confidence, reconstruction.image_size)
+    static = static_cloud(
+        sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, confidence=sure, lens=lens
+    )
     if config.output.clouds:
         moving = dynamic_clouds(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, lens)
         write_clouds(folder, static, _until(should_stop, moving))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.progress import Reporter
+from uni4d_fg.results.confidence_store import remove_confidence, write_confidence
 from uni4d_fg.results.depth_store import write_depth
 from uni4d_fg.results.fusion.averaging import average_over_frames
 from uni4d_fg.results.fusion.bleeding import bleeding_radius
@@ -35,7 +36,9 @@ from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving,
 from uni4d_fg.results.fusion.multiview.measured import MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize, working_frame
 from uni4d_fg.results.fusion.static_depth import StaticDepth, fuse_static, held_out_errors, known_depth, without_edges
+from uni4d_fg.results.fusion.told_error import ToldError, final_confidence
 from uni4d_fg.results.fusion.upsampling import upsample_guided
+from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import zoomed
 
 _CARRIED_REACH, _CARRIED_FROM = 6, 2
@@ -60,7 +63,7 @@ _EDGE = 0.04
 
 
 def fuse_depth(
-    path: Path,
+    folder: RunFolder,
     sequence: Sequence,
     labelled: LabelledTracks,
     scene: Arrays,
@@ -71,10 +74,10 @@ def fuse_depth(
     zoom: FloatArray | None = None,
     lens: Lens = PINHOLE,
 ) -> dict[str, Any]:
-    """Write the fused depth of all frames.
+    """Write the fused depth of all frames, and how sure it is where static depth is made as a field.
 
     Args:
-        path: The ``depth.npy`` of the run.
+        folder: Of the run.
         sequence: Images, depth cue and masks.
         labelled: Observations, with the cue at each.
         scene: Record of stage 2.
@@ -113,18 +116,38 @@ def fuse_depth(
     if not unmatched and not maps.gains_by_matching():
         unmatched = "adds nothing to this cue, as landmarks say"
     # Anew, as the frames that were tried are not in order.
-    maps = replace(maps, unmatched=unmatched, bleeding_px=maps.bleeding_px or 0.0, matched=0, made={}, errors={})
-    with write_depth(path, sequence.num_frames, sequence.image_size) as writer:
+    maps = replace(maps, unmatched=unmatched, bleeding_px=maps.bleeding_px or 0.0, matched=0, made={})
+    remove_confidence(folder.confidence)
+    with ExitStack() as files:
+        writer = files.enter_context(write_depth(folder.depth, sequence.num_frames, sequence.image_size))
+        working = maps.size.height, maps.size.width
+        sure = None
+        if config.static == "field":
+            sure = files.enter_context(write_confidence(folder.confidence, sequence.num_frames, working))
         threads = thread_count()
         for first in range(0, sequence.num_frames, threads):
             if should_stop():
                 raise Cancelled("stopped during fusion; finished stages are kept, --resume continues from them")
             frames = list(range(first, min(first + threads, sequence.num_frames)))
             maps.prepare(frames, threads)
-            for frame, depth in zip(frames, map_in_order(maps.final, frames, threads), strict=True):
+            for frame, (depth, static) in zip(frames, map_in_order(maps.final, frames, threads), strict=True):
                 writer.write(frame, depth)
+                if sure is not None and static is not None:
+                    sure.write(static.confidence)
+                    maps.told.add(static.log_depth, static.confidence, static.still, *maps.landmarks_in(frame))
                 reporter.advance(frame + 1)
     return maps.summary()
+
+
+class FinalStatic(NamedTuple):
+    """Static depth of one frame after averaging, at working size."""
+
+    log_depth: Float32Array
+    """(h, w), NaN where missing."""
+    confidence: Float32Array
+    """(h, w) probability that it is right to 3 %; 0 where something moves."""
+    still: BoolArray
+    """(h, w) outside of masks."""
 
 
 _TRIED_FRAMES = 3
@@ -155,8 +178,8 @@ class DenseMaps:
     """The same of single frames ..."""
     tried: list[float] = field(default_factory=list)
     """... and the error of matched depth at landmarks over that of the cue."""
-    errors: dict[int, float] = field(default_factory=dict)
-    """Frames that are done, to the mean error to expect of their static depth."""
+    told: ToldError = field(default_factory=ToldError)
+    """Of the frames that are done."""
     made: dict[int, tuple[StaticDepth, Float32Array]] = field(default_factory=dict)
     """Per frame: static depth, and the raw cue, at working size."""
 
@@ -208,11 +231,14 @@ class DenseMaps:
         for number in wanted:
             self._static(number)
 
-    def final(self, frame: int) -> Float32Array:
-        """Return the depth (H, W) of a frame, m; frames that are prepared may be asked for on several threads."""
+    def final(self, frame: int) -> tuple[Float32Array, FinalStatic | None]:
+        """Return the depth (H, W) of a frame, m, and what is known of static depth where that is made as a field.
+
+        Frames that are prepared may be asked for on several threads.
+        """
         mask = self.sequence.masks[frame]
         if self.config.static == "nearest_points":
-            return self._by_nearest_points(frame, mask)
+            return self._by_nearest_points(frame, mask), None
         offsets = self.config.averaged_offsets
         static, cue = self._static(frame)
         poses: FloatArray = self.scene["world_T_cam"]
@@ -227,16 +253,16 @@ class DenseMaps:
             ),
             self._camera(frame),
             self.config.averaged_sigmas * float(np.clip(np.nanmedian(static.sigma), *_AVERAGED_SIGMA)),
-        ).depth
-        static_error = static.error[np.isfinite(static.log_depth) & ~self.size.marked(mask)]
-        if static_error.size:
-            self.errors[frame] = float(static_error.mean())
-        full = self._lifted(frame, np.log(averaged), cue)
+        )
+        log_depth = np.log(averaged.depth)
+        unmasked = ~self.size.marked(mask)
+        sure = np.where(unmasked | (static.matched > _STILL), final_confidence(static.confidence, averaged), 0)
+        full = self._lifted(frame, log_depth, cue)
         if (mask > 0).any():
             # Masks reach beyond what moves: what other frames see there just the same stands still.
             still = self.size.enlarge(static.matched) > _STILL
             full = np.where((mask > 0) & ~still, np.exp(self._moving(frame)), full)
-        return full
+        return full, FinalStatic(log_depth, sure.astype(np.float32), unmasked)
 
     def _moving(self, frame: int) -> Float32Array:
         """Return the log depth (H, W) of what moves; means nothing elsewhere."""
@@ -304,15 +330,13 @@ class DenseMaps:
             cue = self._carried(frame) if broken else self.size.depth(self._given(frame))
             shown = self.multiview.shown.get(frame) or self._working_frame(frame)
             measured = None if self.unmatched else self.multiview.at(frame)
-            mine = self.control[frame]
-            usable = (mine.instance == 0) & np.isfinite(mine.log_scale)
-            uv = self.size.pixels(mine.uv[usable])
-            log_z = mine.log_scale[usable] + np.log(mine.cue[usable])
+            uv, log_scale_at, log_cue = self._landmark_cues(frame)
             if not broken:
                 # The cue is read where the landmark is, between pixels: its error there holds for the pixel nearest.
                 column, row = np.clip(np.rint(uv), 0, (self.size.width - 1, self.size.height - 1)).astype(np.int64).T
                 nearest = cue[row, column]
-                log_z = np.where(np.isfinite(nearest), mine.log_scale[usable] + np.log(nearest), log_z)
+                log_cue = np.where(np.isfinite(nearest), np.log(nearest), log_cue)
+            log_z = log_scale_at + log_cue
             static, log_scale = np.isfinite(shown.matched), float(self.scene["log_scale"][frame])
             # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
             errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config)
@@ -337,6 +361,17 @@ class DenseMaps:
                 self.bled += [bled] if np.isfinite(bled) else []
             self.made[frame] = fused, cue
         return self.made[frame]
+
+    def landmarks_in(self, frame: int) -> tuple[FloatArray, FloatArray]:
+        """Return where a frame sees landmarks, (N, 2) working px, and their log depth (N,)."""
+        uv, log_scale, log_cue = self._landmark_cues(frame)
+        return uv, log_scale + log_cue
+
+    def _landmark_cues(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return where a frame sees landmarks, (N, 2) working px, log depth over the cue, and the log cue (N,)."""
+        mine = self.control[frame]
+        usable = (mine.instance == 0) & np.isfinite(mine.log_scale)
+        return self.size.pixels(mine.uv[usable]), mine.log_scale[usable], np.log(mine.cue[usable])
 
     def _carried(self, frame: int) -> Float32Array:
         """Return a frame's depth as the nearest frames with a sound cue show it, at working size."""
@@ -365,11 +400,10 @@ class DenseMaps:
         out: dict[str, Any] = {"broken_frames": sorted(self.broken), "matched_frames": self.matched}
         done = f"in {self.matched} of {self.sequence.num_frames} frames"
         out["facts"] = [f"depth from several views {self.unmatched or done}"]
-        if self.errors:
-            out["depth_error"] = float(np.mean([self.errors[frame] for frame in sorted(self.errors)]))
-            out["facts"].append(
-                f"static depth is off by some {100 * out['depth_error']:.1f} % (estimated, but for scale)"
-            )
+        error = self.told.mean()
+        if error is not None:
+            out["depth_error"] = error
+            out["facts"].append(f"static depth is off by some {100 * error:.1f} % (estimated, but for scale)")
         if self.broken:
             out["warnings"] = [
                 f"the depth cue of {len(self.broken)} frame(s) contradicts what the other frames show; their depth was "

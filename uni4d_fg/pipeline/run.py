@@ -51,6 +51,7 @@ from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.results.confidence_store import read_confidence
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.labels_io import load_labels, save_labels
 from uni4d_fg.results.run_contents import mark_run, run_lock
@@ -411,10 +412,15 @@ def _fuse(
         lambda: read_depth(stored, whole=True), lambda found: found.array.shape == expected
     ):
         run.store.discard("fusion")
+    sure = run.folder.confidence
+    if run.resume and run.config.fusion.static == "field":
+        size = run.sequence.image_size
+        if not _readable(lambda: read_confidence(sure, size), lambda found: len(found) == run.sequence.num_frames):
+            run.store.discard("fusion")
 
     def compute(hooks: Hooks) -> StageRecord:
         summary = fuse_depth(
-            run.folder.depth,
+            run.folder,
             run.sequence,
             labelled,
             scene,

@@ -62,6 +62,8 @@ def centered(run: Run) -> tuple[Run, Crop]:
         )  # fmt: skip
     if run.depth is not None:
         parts["depth"] = cropped(run.depth)
+    if run.confidence is not None:
+        parts["confidence"] = cropped(run.confidence)
     if run.labelled is not None:
         parts["labelled"] = _cropped_tracks(run.labelled, crop)
     return run.with_parts(**parts), crop

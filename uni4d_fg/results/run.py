@@ -22,6 +22,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.results.confidence_store import read_confidence
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.labels_io import load_labels
@@ -35,6 +36,8 @@ ValueT = TypeVar("ValueT")
 SequenceReader: TypeAlias = Callable[[], "Sequence | Video"]
 
 _PARTS = {"labelled": "tracks are not shown", "depth": "fused depth is not shown", "sequence": "images are not shown"}
+_OPTIONAL_PARTS = ("confidence",)
+"""Nobody misses them."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ class Run:
         """Return the run with other parts: attributes by name; an InputError stands for a part that is not there."""
         changed = copy.copy(self)
         for name, value in parts.items():
-            if name not in _PARTS:
+            if name not in (*_PARTS, *_OPTIONAL_PARTS):
                 setattr(changed, name, value)
             elif isinstance(value, InputError):
                 changed.__dict__[f"_{name}"] = _Part(None, value)
@@ -154,6 +157,11 @@ class Run:
         return self._depth.value
 
     @property
+    def confidence(self) -> FrameSource[Float32Array] | None:
+        """T maps (H, W), the probability that static depth is right to 3 %; absent where it is not known."""
+        return self._confidence.value
+
+    @property
     def sequence(self) -> Sequence | Video | None:
         """What was reconstructed, if it is still where it was."""
         return self._sequence.value
@@ -195,6 +203,10 @@ class Run:
         return _Part.read(self._load_depth)
 
     @cached_property
+    def _confidence(self) -> _Part[FrameSource[Float32Array]]:
+        return _Part.read(self._load_confidence)
+
+    @cached_property
     def _sequence(self) -> _Part[Sequence | Video]:
         return _Part.read(self._load_sequence)
 
@@ -211,6 +223,12 @@ class Run:
         if depth.array.shape != expected:
             raise InputError(f"{self.folder.depth}: has shape {depth.array.shape}, but the run has {expected}")
         return depth
+
+    def _load_confidence(self) -> FrameSource[Float32Array]:
+        confidence = read_confidence(self.folder.confidence, self.reconstruction.image_size)
+        if len(confidence) != self.num_frames:
+            raise InputError(f"{self.folder.confidence}: has {len(confidence)} frames, but the run {self.num_frames}")
+        return confidence
 
     def _load_sequence(self) -> Sequence | Video:
         if self._read_sequence is None:

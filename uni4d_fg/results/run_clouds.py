@@ -67,8 +67,9 @@ def static_cloud(
         fusion = fusion.model_copy(update={"static_frame_stride": stride})
     masks = sequence.masks if sequence.masks is not None else _NoMasks(run.num_frames, sequence.image_size)
     cloud = clouds.static_cloud(
-        sequence.images, depth, masks, result.frame_intrinsics, result.world_T_cam, fusion, lens=result.lens
-    )
+        sequence.images, depth, masks, result.frame_intrinsics, result.world_T_cam, fusion,
+        confidence=run.confidence, lens=result.lens,
+    )  # fmt: skip
     return ColoredPoints.of(*cloud, np.zeros(len(cloud.points), np.int32)), "depth"
 
 

@@ -31,6 +31,11 @@ class RunFolder:
         return self.root / "depth.npy"
 
     @property
+    def confidence(self) -> Path:
+        """How sure static depth is, (T, h, w), 8 bits (``.npy``); absent where it is not known."""
+        return self.root / "confidence.npy"
+
+    @property
     def summary(self) -> Path:
         """What the run did, as JSON."""
         return self.root / "summary.json"

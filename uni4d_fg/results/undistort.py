@@ -102,6 +102,8 @@ def undistorted(run: Run) -> Run:
         )  # fmt: skip
     if run.depth is not None:
         parts["depth"] = nearest(run.depth)
+    if run.confidence is not None:
+        parts["confidence"] = nearest(run.confidence)
     if run.labelled is not None:
         parts["labelled"] = how.tracks(run.labelled, result.image_size)
     return run.with_parts(**parts)

@@ -15,6 +15,7 @@ from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.se3 import retract
 from uni4d_fg.results.clouds import write_clouds
+from uni4d_fg.results.confidence_store import write_confidence
 from uni4d_fg.results.depth_store import read_depth, write_depth
 from uni4d_fg.results.fusion.clouds import dynamic_clouds, static_cloud
 from uni4d_fg.results.io import save_reconstruction
@@ -40,6 +41,9 @@ def write_run(sequence_folder: Path, run_folder: Path) -> None:
             holes = depth.copy()
             holes[10:20, 30 + frame : 50] = np.nan
             store.write(frame, holes)
+    with write_confidence(run.confidence, sequence.num_frames, (SCENE.height // 2, SCENE.width // 2)) as sure:
+        for frame in range(sequence.num_frames):
+            sure.write(np.full((SCENE.height // 2, SCENE.width // 2), 0.9 + 0.01 * frame, np.float32))
     maps = read_depth(run.depth)
     arguments = (sequence.images, maps, sequence.masks, result.intrinsics, result.world_T_cam, config.fusion)
     write_clouds(run, static_cloud(*arguments), dynamic_clouds(*arguments))

@@ -95,6 +95,8 @@ def test_images_masks_and_depth_lie_where_colmap_looks(
         hidden += int((mask == 0).sum())
         depth = read_colmap_array(folder / "depth_maps" / f"{name}.geometric.bin")
         np.testing.assert_array_equal(depth, np.nan_to_num(source.depth[frame], nan=0.0))
+        sure = cv2.imread(str(folder / "confidence" / f"{Path(name).stem}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(sure, np.full_like(mask, round(255 * (0.9 + 0.01 * frame))))
     assert hidden > 0
     # COLMAP itself can open the pictures.
     assert pycolmap.Bitmap.read(str(folder / "images" / names[0]), True) is not None

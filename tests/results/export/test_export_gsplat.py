@@ -139,6 +139,7 @@ def test_depth_is_the_inverse_that_the_loader_expects(source: Run, exported: Exp
     folder, _ = exported("gsplat", depth=True)
     stems = sorted(path.stem for path in (folder / "images").iterdir())
     assert sorted(path.stem for path in (folder / "depths").iterdir()) == stems
+    assert sorted(path.stem for path in (folder / "confidence").iterdir()) == stems
     for frame, stem in enumerate(stems):
         loaded, depth = inverse_depth(folder, stem), source.depth[frame]  # type: ignore[index]
         visible = np.asarray(Image.open(folder / "images" / f"{stem}.png"))[..., 3] > 0

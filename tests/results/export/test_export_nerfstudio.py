@@ -83,6 +83,9 @@ def test_masks_and_depth_fit_the_images(source: Run, exported: Export) -> None:
         assert stored.dtype == np.uint16
         expected = np.nan_to_num(source.depth[frame], nan=0.0)  # type: ignore[index]
         np.testing.assert_allclose(stored * 1e-3, expected, rtol=0, atol=0.00051)
+        sure = cv2.imread(str(folder / "confidence" / Path(entry["depth_file_path"]).name), cv2.IMREAD_UNCHANGED)
+        assert sure.shape == stored.shape
+        np.testing.assert_array_equal(sure, round(255 * (0.9 + 0.01 * frame)))
 
 
 def test_the_point_cloud_is_in_the_same_world(source: Run, exported: Export) -> None:

@@ -133,3 +133,15 @@ def test_sizes_that_disagree_are_refused() -> None:
     small = ArrayFrames(np.ones((FRAMES, 4, 4), np.float32))
     with pytest.raises(InputError, match="frame 0"):
         static_cloud(images, small, masks, INTRINSICS, poses, PLAIN)
+
+
+def test_points_that_are_not_sure_are_no_part_of_the_static_cloud() -> None:
+    images, depths, masks, poses = video()
+    unsure = np.full((FRAMES, HEIGHT, WIDTH), 0.95, np.float32)
+    unsure[:, :, :4] = 0.5
+    whole = static_cloud(images, depths, masks, INTRINSICS, poses, PLAIN)
+    sure = static_cloud(images, depths, masks, INTRINSICS, poses, PLAIN, confidence=ArrayFrames(unsure))
+    assert len(whole.points) - len(sure.points) == FRAMES * HEIGHT * 4
+    everything = PLAIN.model_copy(update={"cloud_confidence": 0.0})
+    again = static_cloud(images, depths, masks, INTRINSICS, poses, everything, confidence=ArrayFrames(unsure))
+    assert len(again.points) == len(whole.points)

@@ -101,7 +101,9 @@ def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(
     known = known_depth(None, uv, log_z, static, (HEIGHT, WIDTH))
     fused = fuse_static(noisy, None, known, found.cue, static, NOWHERE, 0.0, 0.0, FusionConfig())
     true_error = float(np.abs(fused.log_depth - truth).mean())
-    assert 1 / 1.5 < float(fused.error.mean()) / true_error < 1.5
+    assert 1 / 1.5 < found.cue / true_error < 1.5
+    right = float((np.abs(fused.log_depth - truth) < 0.03).mean())
+    assert abs(float(fused.confidence.mean()) - right) < 0.15
 
 
 def test_matched_depth_that_is_sure_wins_over_a_cue_that_is_wrong_and_says_so(rng: np.random.Generator) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from uni4d_fg.frontend.trajectory_files import continuous_quaternions
 from uni4d_fg.geometry.se3 import inverse
 from uni4d_fg.results.export.colmap_files import ColmapModel, depth_map_bytes, write_binary, write_text
-from uni4d_fg.results.export.frames import write_images, write_masks
+from uni4d_fg.results.export.frames import write_confidence, write_images, write_masks
 from uni4d_fg.results.export.model import ExportJob
 from uni4d_fg.results.export.observations import StaticObservations, static_observations
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -41,6 +41,7 @@ def write_colmap(job: ExportJob) -> None:
             job.facts.append("masks/: 0 where something moves (give it to COLMAP as mask_path)")
     if job.options.depth:
         _write_depth(job, job.folder / "depth_maps", names)
+        write_confidence(job, job.folder / "confidence", [Path(name).stem for name in names])
 
 
 def colmap_model(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence as SequenceOf
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,27 @@ def write_masks(job: ExportJob, folder: Path, names: list[str]) -> int:
         path.write_bytes(encode(np.where(mask > 0, 0, 255).astype(np.uint8), ".png", path))
         job.check()
     return len(names)
+
+
+def write_confidence(job: ExportJob, folder: Path, stems: SequenceOf[str]) -> None:
+    """Write how sure static depth is, one 8-bit PNG per frame; nothing if the run does not know.
+
+    Args:
+        job: The export.
+        folder: Where to write; made if anything is written.
+        stems: File names without suffix, T.
+    """
+    confidence = job.run.confidence
+    if confidence is None:
+        return
+    folder.mkdir(parents=True)
+    for stem, sure in zip(stems, confidence, strict=True):
+        path = folder / f"{stem}.png"
+        path.write_bytes(encode(np.rint(255 * sure).astype(np.uint8), ".png", path))
+        job.check()
+    job.facts.append(
+        f"{folder.name}/: 8-bit PNG, 255 times the probability that static depth is right to 3 %, 0 where it moves"
+    )
 
 
 def depth_png(depth: Float32Array, path: Path) -> bytes:

@@ -30,7 +30,7 @@ from uni4d_fg.results.export.dense import (
     static_cloud_with_normals,
     without_holes,
 )
-from uni4d_fg.results.export.frames import encode, frame_names, write_images
+from uni4d_fg.results.export.frames import encode, frame_names, write_confidence, write_images
 from uni4d_fg.results.export.model import ExportJob
 from uni4d_fg.results.export.observations import static_observations
 from uni4d_fg.results.run import Run
@@ -63,6 +63,7 @@ def write_gsplat(job: ExportJob) -> None:
     write_ply(folder / "points3D.ply", cloud.points, cloud.colors, cloud.normals)
     if job.options.depth:
         _write_depth(job, job.folder / "depths", folder / "depth_params.json", names)
+        write_confidence(job, job.folder / "confidence", [Path(name).stem for name in names])
     job.figures |= {"images": len(names), "landmarks": len(model.points), "points": len(cloud.points)}
     job.facts.append(
         f"{len(names)} images, {len(model.points)} landmarks, {len(cloud.points)} dense points with normals"

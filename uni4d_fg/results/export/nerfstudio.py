@@ -17,7 +17,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.files import atomic_write_json
 from uni4d_fg.results.clouds import write_ply
 from uni4d_fg.results.export.clouds import static_cloud
-from uni4d_fg.results.export.frames import MAX_PNG_DEPTH, depth_png, encode, write_images, write_masks
+from uni4d_fg.results.export.frames import MAX_PNG_DEPTH, depth_png, encode, write_confidence, write_images, write_masks
 from uni4d_fg.results.export.model import ExportJob
 from uni4d_fg.results.normals import normal_colors, normal_map
 
@@ -62,6 +62,7 @@ def write_nerfstudio(job: ExportJob) -> None:
     meta: dict[str, Any] = {}
     if job.options.depth:
         _write_depth(job, job.folder / "depths", stems, frames)
+        write_confidence(job, job.folder / "confidence", stems)
         meta["depth_unit_scale_factor"] = 0.001
     fx, fy, cx, cy = result.intrinsics.tolist()
     height, width = result.image_size

@@ -50,7 +50,9 @@ class FilmClouds:
         """
         run = self.run
         if run.sequence is not None and run.depth is not None:
-            points, colors = dense_static_cloud(run.sequence, run.depth, run.reconstruction, self._fusion, _MOST_POINTS)
+            points, colors = dense_static_cloud(
+                run.sequence, run.depth, run.confidence, run.reconstruction, self._fusion, _MOST_POINTS
+            )
         else:
             cloud, _ = static_cloud(run, self._fusion)
             if cloud is None:

@@ -21,6 +21,8 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray
 
 _OUTSIDE = -1e4
+_ALIKE = 0.03
+"""Log depths that differ by less are the same."""
 
 
 class Averaged(NamedTuple):
@@ -32,6 +34,8 @@ class Averaged(NamedTuple):
     """(H, W) number of other frames that agree."""
     seeing: Float32Array
     """(H, W) number of other frames that have depth where the pixel falls in them."""
+    alike: Float32Array
+    """(H, W) number of those whose depth is the same to 3 %."""
 
 
 def average_over_frames(
@@ -59,6 +63,7 @@ def average_over_frames(
     correction = np.zeros(height * width, np.float32)
     count = np.zeros(height * width, np.float32)
     seeing = np.zeros(height * width, np.float32)
+    alike = np.zeros(height * width, np.float32)
     for other, pose, camera in others:
         fx, fy, cx, cy = (np.float32(value) for value in camera)
         other_T_cam = np.linalg.solve(pose, world_T_cam).astype(np.float32)
@@ -78,11 +83,12 @@ def average_over_frames(
             )
             difference = np.log(inverse / inverse_sample.reshape(-1))
             agrees = np.abs(difference) < max_disagreement
+            alike += np.abs(difference) < _ALIKE
         np.add(correction, difference, out=correction, where=agrees)
         count += agrees
         seeing += np.isfinite(difference)
     result: Float32Array = depth * np.exp(correction / (count + 1)).reshape(height, width)
-    return Averaged(result, count.reshape(height, width), seeing.reshape(height, width))
+    return Averaged(result, *(found.reshape(height, width) for found in (count, seeing, alike)))
 
 
 def _inside_or_out(position: Float32Array) -> Float32Array:

@@ -35,12 +35,14 @@ def static_cloud(
     world_T_cam: FloatArray,
     config: FusionConfig,
     *,
+    confidence: FrameSource[Float32Array] | None = None,
     band_px: int = 5,
     lens: Lens = PINHOLE,
 ) -> Cloud:
     """Build the cloud of everything that does not move, over the whole video.
 
-    Pixels of moving instances, a band around them, and pixels at depth edges are left out. Points that share
+    Pixels of moving instances, a band around them, and pixels at depth edges are left out, and so are those that are
+    not sure, as other frames see through them or past them. Points that share
     a voxel are averaged; merging goes on while frames are read, so that memory does not grow with the video.
 
     Args:
@@ -49,7 +51,8 @@ def static_cloud(
         masks: T label maps (H, W), 0 static.
         intrinsics: (4,) fx, fy, cx, cy, px, or (T, 4) of each frame.
         world_T_cam: (T, 4, 4) camera to world, meters.
-        config: Strides, voxel size and edge threshold.
+        config: Strides, voxel size, edge threshold and least confidence.
+        confidence: T maps (H, W), the probability that depth is right to 3 %; None where it is not known.
         band_px: Width of the band around instances, px.
         lens: Distortion of the images.
 
@@ -62,6 +65,8 @@ def static_cloud(
     for frame in range(0, len(images), config.static_frame_stride):
         image, depth, mask = _maps(frame, images, depths, masks)
         keep = ~dilate(mask > 0, band_px) & ~depth_edges(depth, config.edge_relative_gradient)
+        if confidence is not None:
+            keep &= confidence[frame] >= config.cloud_confidence
         part = lift(image, depth, keep, cameras[frame], world_T_cam[frame], config.static_stride, lens)
         parts.append(part)
         waiting += len(part.points)

@@ -48,6 +48,7 @@ class _Seen(NamedTuple):
 def dense_static_cloud(
     sequence: Sequence | Video,
     depths: FrameSource[Float32Array],
+    confidence: FrameSource[Float32Array] | None,
     result: Reconstruction,
     fusion: FusionConfig,
     max_points: int,
@@ -64,8 +65,9 @@ def dense_static_cloud(
     Args:
         sequence: Images, and masks if there are any.
         depths: T maps (H, W), meters, NaN where missing.
+        confidence: T maps (H, W), the probability that they are right to 3 %; None where it is not known.
         result: Cameras.
-        fusion: Edge threshold.
+        fusion: Edge threshold and least confidence.
         max_points: Most points of the cloud.
         max_frames: Most frames used, evenly spread.
         should_stop: Asked between frames; the cloud so far is returned then.
@@ -77,7 +79,7 @@ def dense_static_cloud(
     for frame in range(0, result.num_frames, step):
         if should_stop():
             break
-        waiting = waiting.and_of(_lifted(sequence, depths, result, frame, fusion))
+        waiting = waiting.and_of(_lifted(sequence, depths, confidence, result, frame, fusion))
         if len(waiting.points) > _POINTS_BETWEEN_MERGES:
             kept, waiting = kept.and_of(waiting).nearest_per_voxel(voxel), nothing
     kept = kept.and_of(waiting).nearest_per_voxel(voxel)
@@ -90,12 +92,15 @@ def dense_static_cloud(
 def _lifted(
     sequence: Sequence | Video,
     depths: FrameSource[Float32Array],
+    confidence: FrameSource[Float32Array] | None,
     result: Reconstruction,
     frame: int,
     fusion: FusionConfig,
 ) -> _Seen:
     depth = depths[frame]
     keep = ~depth_edges(depth, fusion.edge_relative_gradient)
+    if confidence is not None:
+        keep &= confidence[frame] >= fusion.cloud_confidence
     if sequence.masks is not None:
         keep &= ~dilate(sequence.masks[frame] > 0, _BAND_PX)
     pose = result.world_T_cam[frame]

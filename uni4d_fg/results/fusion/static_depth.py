@@ -20,8 +20,6 @@ _LANDMARK_SIGMA = 0.006
 _LANDMARK_SHARE = 0.5
 """Weight of a landmark beside a sure match."""
 _SURE = 0.8
-_WRONG_ERROR = 0.15
-"""Mean absolute error of log depth where it is wrong, on scenes with truth."""
 _RIGHT = 0.03
 _MEAN_TO_SIGMA = 1.2533
 """Standard deviation over mean absolute error, of a normal distribution."""
@@ -69,10 +67,8 @@ class StaticDepth:
     """NaN where nothing is known."""
     sigma: Float32Array
     """Standard deviation of its error where it is right."""
-    error: Float32Array
-    """Mean absolute error to expect, wrong matches among them."""
     confidence: Float32Array
-    """Probability that it is right to 3 %."""
+    """Probability that it is right to 3 %, as far as one frame knows."""
     corrected: CorrectedCue
     """The cue alone."""
     matched: Float32Array
@@ -165,9 +161,9 @@ def fuse_static(
         # The cue errs less where landmarks have corrected it, but frames are compared everywhere.
         usual = corrected.spread if np.isfinite(corrected.spread) else _UNCOMPARED_SIGMA
         sigma = np.full(shape, max(usual, _LANDMARK_SIGMA), np.float32)
-        error = np.full(shape, cue_error if np.isfinite(cue_error) else usual / _MEAN_TO_SIGMA, np.float32)
-        sure = _within(_MEAN_TO_SIGMA * error) * np.isfinite(corrected.log_depth)
-        return StaticDepth(corrected.log_depth, sigma, error, sure.astype(np.float32), corrected, np.zeros_like(sigma))
+        error = np.full(shape, _MEAN_TO_SIGMA * cue_error if np.isfinite(cue_error) else usual, np.float32)
+        sure = _within(error) * np.isfinite(corrected.log_depth)
+        return StaticDepth(corrected.log_depth, sigma, sure.astype(np.float32), corrected, np.zeros_like(sigma))
     cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
     has_cue = np.isfinite(corrected.log_depth)
     mixed = np.zeros(shape, dtype=bool)
@@ -195,10 +191,8 @@ def fuse_static(
     share = np.where(has_cue, chosen / (both + match_alone + cue_alone + neither), p)
     share[filled] = _FILLED_RIGHT
     sure = share * _within(sigma)
-    error = share * sigma / _MEAN_TO_SIGMA + (1 - share) * _WRONG_ERROR
     return StaticDepth(
-        log_depth.astype(np.float32), sigma.astype(np.float32), error.astype(np.float32), sure.astype(np.float32),
-        corrected, measured.confidence,
+        log_depth.astype(np.float32), sigma.astype(np.float32), sure.astype(np.float32), corrected, measured.confidence
     )  # fmt: skip
 
 

@@ -68,7 +68,7 @@ class RunClouds:
             return None
         limit = self.limits.static_points
         cloud = dense_static_cloud(
-            run.sequence, run.depth, run.reconstruction, self.fusion, limit, should_stop=should_stop
+            run.sequence, run.depth, run.confidence, run.reconstruction, self.fusion, limit, should_stop=should_stop
         )
         return ColoredPoints.of(*cloud, np.zeros(len(cloud.points), np.int32))
 

@@ -1,0 +1,56 @@
+"""Confidence after averaging, and the error that is told, against what is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uni4d_fg.results.fusion.averaging import Averaged
+from uni4d_fg.results.fusion.told_error import ToldError, final_confidence
+
+SHAPE = (60, 80)
+
+
+def averaged(alike: float, seeing: float, depth: np.ndarray | None = None) -> Averaged:
+    maps = [np.full(SHAPE, value, np.float32) for value in (alike, seeing, alike)]
+    return Averaged(np.full(SHAPE, 2.0, np.float32) if depth is None else depth, *maps)
+
+
+def test_confidence_falls_where_frames_disagree_and_beside_edges() -> None:
+    alone = np.full(SHAPE, 0.95, np.float32)
+    agreed = final_confidence(alone, averaged(8, 8))
+    assert agreed.min() > 0.9
+    assert final_confidence(alone, averaged(2, 8)).max() < 0.7
+    assert final_confidence(np.full(SHAPE, 0.3, np.float32), averaged(8, 8)).max() < 0.9
+    step = np.where(np.arange(SHAPE[1]) < 40, 2.0, 3.0).astype(np.float32) * np.ones((SHAPE[0], 1), np.float32)
+    step[:, 70] = np.nan
+    beside = final_confidence(alone, averaged(8, 8, step))
+    np.testing.assert_allclose(beside[:, :36], agreed[:, :36])
+    assert (beside[:, 38:42] < agreed[:, 38:42] - 0.01).all()
+    np.testing.assert_array_equal(beside[:, 70], 0)
+    np.testing.assert_allclose(beside[:, 72:], agreed[:, 72:])
+
+
+@pytest.mark.parametrize(("share", "noise"), [(0.0, 0.003), (0.1, 0.004), (0.2, 0.008)])
+def test_the_error_is_told_from_landmarks_and_confidence(share: float, noise: float, rng: np.random.Generator) -> None:
+    """A part of the depth is off by 10 %, and said to be unsure; landmarks lie there three times as often."""
+    told, errors = ToldError(), []
+    for _ in range(5):
+        wrong = np.zeros(SHAPE, bool)
+        wrong[:, : round(share * SHAPE[1])] = True
+        off = np.where(wrong, 0.1, 0.0) + noise * rng.standard_normal(SHAPE)
+        confidence = np.where(wrong, 0.25, 0.985).astype(np.float32)
+        places = np.argwhere(rng.random(SHAPE) < np.where(wrong, 0.15, 0.05))
+        uv = np.concatenate([places[:, ::-1], [[-3, 5], [500, 5]]]).astype(np.float64)
+        told.add(off.astype(np.float32), confidence, np.ones(SHAPE, bool), uv, np.zeros(len(uv)))
+        errors.append(np.abs(off).mean())
+    mean = told.mean()
+    assert mean is not None
+    assert 1 / 1.5 < mean / np.mean(errors) < 1.5
+
+
+def test_without_static_pixels_no_error_is_told_and_without_landmarks_the_usual_one() -> None:
+    told, everywhere = ToldError(), np.ones(SHAPE, bool)
+    assert told.mean() is None
+    told.add(np.zeros(SHAPE, np.float32), np.ones(SHAPE, np.float32), everywhere, np.zeros((0, 2)), np.zeros(0))
+    assert told.mean() == pytest.approx(0.0025)

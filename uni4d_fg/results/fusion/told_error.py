@@ -1,0 +1,98 @@
+"""How sure static depth is once frames are averaged, and how far it is off in the mean, fitted to scenes with truth.
+
+The probability that a pixel is right to 3 % is a logistic function of what its own frame says, of the other frames
+that see it, and of the edges beside it. The mean error is the geometric mean of two estimates that err differently:
+the error that goes with such probabilities on scenes with truth, and how far landmarks are from the depth at pixels as
+sure as theirs. (Landmarks do not see the errors that they share with the depth, those of the cameras. They also lie on
+texture, where depth is best, and beside edges, where it is worst: comparing equally sure pixels takes this out.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
+from uni4d_fg.results.fusion.averaging import Averaged
+
+_WEIGHTS = np.array([-2.2, 0.554, 3.029, 0.499, -2.556], dtype=np.float32)
+_MANY_FRAMES = 4
+_EDGE_WINDOW = np.ones((5, 5), np.uint8)
+_STEEPEST = 0.3
+_BEYOND = 99.0
+"""Beyond all log depths."""
+_BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
+_SURE_ERROR, _WRONG_ERROR = 0.0025, 0.08
+"""Mean error at a probability of 1, and what a lower one adds per unit."""
+_MIN_COMPARED = 10
+
+
+def final_confidence(alone: Float32Array, averaged: Averaged) -> Float32Array:
+    """Return the probability (h, w) that depth is right to 3 %; 0 where there is none.
+
+    Args:
+        alone: (h, w) the same, as the frame alone says.
+        averaged: Depth, and what the other frames say of it.
+    """
+    log_depth = np.log(averaged.depth)
+    missing = ~np.isfinite(log_depth)
+    far = cv2.dilate(np.where(missing, np.float32(-_BEYOND), log_depth), _EDGE_WINDOW)
+    near = cv2.erode(np.where(missing, np.float32(_BEYOND), log_depth), _EDGE_WINDOW)
+    steep = np.where(missing, 0, np.clip(far - near, 0, _STEEPEST))
+    bounded = np.clip(alone, 1e-3, 1 - 1e-3)
+    share = averaged.alike / np.maximum(averaged.seeing, 1)
+    seen = np.minimum(averaged.seeing, _MANY_FRAMES) / _MANY_FRAMES
+    features = np.stack([np.ones_like(share), np.log(bounded / (1 - bounded)), share, seen, steep], axis=-1)
+    probability = 1 / (1 + np.exp(-features.astype(np.float32) @ _WEIGHTS))
+    return np.where(missing, np.float32(0), probability).astype(np.float32)
+
+
+@dataclass
+class ToldError:
+    """Collects, frame by frame, what the mean error of static depth is told from."""
+
+    pixels: FloatArray = field(default_factory=lambda: np.zeros(len(_BINS) + 1))
+    """Number of static pixels by how sure they are."""
+    expected: float = 0.0
+    """Sum of the errors that go with these probabilities."""
+    off: list[list[FloatArray]] = field(default_factory=lambda: [[] for _ in range(len(_BINS) + 1)])
+    """By the same: ``|log depth - log z|`` at landmarks."""
+
+    def add(
+        self, log_depth: Float32Array, confidence: Float32Array, static: BoolArray, uv: FloatArray, log_z: FloatArray
+    ) -> None:
+        """Add a frame.
+
+        Args:
+            log_depth: (h, w), NaN where missing.
+            confidence: (h, w).
+            static: (h, w) what is counted.
+            uv: (N, 2) landmarks, working px.
+            log_z: (N,) their log depth.
+        """
+        counted = static & np.isfinite(log_depth)
+        sure = confidence[counted].astype(np.float64)
+        self.pixels += np.bincount(np.digitize(sure, _BINS), minlength=len(_BINS) + 1)
+        self.expected += float((_SURE_ERROR + _WRONG_ERROR * (1 - sure)).sum())
+        column, row = np.rint(uv).astype(np.int64).T
+        inside = (column >= 0) & (row >= 0) & (column < static.shape[1]) & (row < static.shape[0])
+        inside[inside] = counted[row[inside], column[inside]]
+        at = row[inside], column[inside]
+        bins, off = np.digitize(confidence[at], _BINS), np.abs(log_depth[at] - log_z[inside])
+        for number, found in enumerate(self.off):
+            found.append(off[bins == number])
+
+    def mean(self) -> float | None:
+        """Return the mean relative error to expect, scale apart; None if no pixel is static."""
+        total = float(self.pixels.sum())
+        if total == 0:
+            return None
+        prior = self.expected / total
+        found = [np.concatenate(off) if off else np.zeros(0) for off in self.off]
+        everywhere = np.concatenate(found)
+        if len(everywhere) < _MIN_COMPARED:
+            return prior
+        typical = [float(np.median(off if len(off) >= _MIN_COMPARED else everywhere)) for off in found]
+        return float(np.sqrt(prior * (self.pixels @ np.array(typical)) / total))
