@@ -47,6 +47,9 @@ class CameraConfig(Section):
         0.003, "Part of the reprojection energy that free distortion must take away to be taken.", ge=0, lt=1
     )
     min_displacement_px: float = setting(1.0, "Distance by which it must move some pixel of the image, px.", ge=0)
+    sure_displacement: float = setting(
+        0.02, "Part of the longer image side below which that distance needs a gain on held-out tracks too.", ge=0, le=1
+    )
 
     @field_validator("starts")
     @classmethod

@@ -28,7 +28,7 @@ from uni4d_fg.pipeline.inertial import imu_fact, imu_summary
 from uni4d_fg.pipeline.rigid import rigid_objects_part
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
-from uni4d_fg.pipeline.warnings import scene_warnings
+from uni4d_fg.pipeline.warnings import scene_warnings, unmasked_motion_warnings
 from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy, energy_of
@@ -119,7 +119,7 @@ def bundle_adjustment_step(
             raise
         return _without_landmarks(cameras, config, str(reason))
     stop_if_cancelled(scene.solves)
-    return StageRecord(scene_arrays(scene), _scene_summary(sequence, scene, config))
+    return StageRecord(scene_arrays(scene), _scene_summary(sequence, labelled, scene, config))
 
 
 def _with_imu(
@@ -140,7 +140,7 @@ def _with_imu(
     solver = StaticSceneSolver(config, adding, hooks, find_fragments=find_fragments, timestamps=sequence.timestamps)
     scene = solver.adjust(labelled, first.cameras, prior, freedom)
     stop_if_cancelled(scene.solves)
-    summary = _scene_summary(sequence, replace(scene, solves=[*first.solves, *scene.solves]), config)
+    summary = _scene_summary(sequence, labelled, replace(scene, solves=[*first.solves, *scene.solves]), config)
     summary["imu"] = imu_summary(first, adding)
     summary["facts"].append(imu_fact(summary["imu"]))
     return StageRecord(scene_arrays(scene), summary)
@@ -162,9 +162,9 @@ def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-def _scene_summary(sequence: Sequence, scene: StaticScene, config: Config) -> dict[str, Any]:
+def _scene_summary(sequence: Sequence, labelled: LabelledTracks, scene: StaticScene, config: Config) -> dict[str, Any]:
     solves = [solve_dict(s) for s in scene.solves]
-    summary = bundle_summary(sequence, scene_arrays(scene), len(scene.observations), scene.dropped, solves)
+    summary = bundle_summary(sequence, labelled, scene_arrays(scene), len(scene.observations), scene.dropped, solves)
     if scene.joined:
         summary["joined_tracks"] = scene.joined
         summary["facts"].append(f"{scene.joined} tracks joined to earlier ones of the same point")
@@ -187,7 +187,12 @@ def paper_energy(scene: StaticScene, normalization: Normalization) -> dict[str, 
 
 
 def bundle_summary(
-    sequence: Sequence, arrays: Arrays, num_observations: int, dropped: dict[str, int], solves: list[dict[str, Any]]
+    sequence: Sequence,
+    labelled: LabelledTracks,
+    arrays: Arrays,
+    num_observations: int,
+    dropped: dict[str, int],
+    solves: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """Return what ``summary.json`` says of stage 2, from its record's arrays."""
     (fx, fy), landmarks = arrays["intrinsics"][:2], arrays["landmarks"]
@@ -198,6 +203,9 @@ def bundle_summary(
     ]
     warnings = scene_warnings(
         sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"]
+    )
+    warnings += unmasked_motion_warnings(
+        labelled, arrays["landmark_track"], arrays["landmark_error"], float(pixel), max(sequence.image_size)
     )
     return {"solves": solves, "dropped": dropped, "facts": facts, "warnings": warnings}
 

@@ -4,13 +4,61 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 
 _MAX_FOCAL_CHANGE = 0.15
 _MIN_BASELINE = 0.01
 """Of the scene's depth."""
 _MAX_UNCERTAINTY = 0.05
 """Root mean square of the positions' sigmas, of the path's length: a path that may be off by a twentieth of itself."""
+
+_MOVES_SIGMAS, _MOVES_PART = 3.0, 0.01
+"""Median reprojection error of a track that does not fit a static world: as a multiple of the noise, and at least, as a
+part of the longer image side; what lies below may be a tracker's or a lens's, alike in neighboring tracks too."""
+_MOVING_SHARE = 0.03
+"""Share of such tracks from which something seems to move."""
+_BY_CHANCE = 1e-3
+"""Probability that as many of them lie side by side by chance, below which they are one thing and no stray tracks."""
+
+
+def unmasked_motion_warnings(
+    labelled: LabelledTracks,
+    landmark_track: IntArray,
+    landmark_error: Float32Array,
+    noise_px: float,
+    longer_side_px: int,
+) -> list[str]:
+    """Return a sentence if something seems to move and no track was labelled as moving.
+
+    Tracks of a moving thing that is taken for static fit no camera; unlike stray tracks they lie side by side.
+
+    Args:
+        labelled: All tracks.
+        landmark_track: (N,) tracks of the static scene's landmarks.
+        landmark_error: (N,) their median reprojection errors, px.
+        noise_px: Standard deviation of the static scene's reprojection.
+        longer_side_px: Of the images.
+    """
+    if len(landmark_track) < 2 or (labelled.label == TrackLabel.DYNAMIC).any():
+        return []
+    moves = landmark_error > max(_MOVES_SIGMAS * noise_px, _MOVES_PART * longer_side_px)
+    share = float(moves.mean())
+    if share < _MOVING_SHARE:
+        return []
+    from scipy.spatial import cKDTree
+    from scipy.stats import binom
+
+    seen = labelled.weight[landmark_track, :, None] > 0
+    place = np.where(seen, labelled.tracks.uv[landmark_track], 0.0).sum(axis=1) / seen.sum(axis=1)
+    _, nearest = cKDTree(place).query(place[moves], k=2)
+    beside = int(moves[nearest[:, 1]].sum())
+    if binom.sf(beside - 1, int(moves.sum()), share) > _BY_CHANCE:
+        return []
+    return [
+        f"{100 * share:.0f} % of the static tracks lie together and fit no static world: something seems to move, and "
+        "no mask covers it; give masks, or let them be made from motion"
+    ]
 
 
 def focal_warnings(given_intrinsics: FloatArray, focal_px: FloatArray) -> list[str]:

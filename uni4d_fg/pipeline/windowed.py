@@ -142,7 +142,8 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
     solves += [solve_dict(s) for part in parts for s in part.solves]
     dropped["landmark far from its neighbors"] = sum(part.dropped for part in parts)
     arrays = _joined_arrays(windows, joined, parts)
-    summary = bundle_summary(windowed.sequence, arrays, int(sum(part.count.sum() for part in parts)), dropped, solves)
+    count = int(sum(part.count.sum() for part in parts))
+    summary = bundle_summary(windowed.sequence, labelled, arrays, count, dropped, solves)
     summary["facts"].append(f"{len(windows)} windows of {len(windows[0])} frames, joined {config.windows.rounds} times")
     return StageRecord(arrays, summary)
 

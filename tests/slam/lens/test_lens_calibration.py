@@ -15,6 +15,7 @@ from uni4d_fg.errors import ConfigError, DegenerateProblemError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.pipeline import reconstruct
@@ -156,3 +157,16 @@ def test_a_model_that_is_neither_given_nor_estimated_is_refused(barrel: Sequence
         stream_sequence(plain, Path("nowhere"), asked)
     for model in ("auto", "pinhole"):
         assert known_camera(plain, config(f"camera.model={model}", change)).lens == PINHOLE
+
+
+@pytest.mark.slow
+def test_a_small_distortion_needs_held_out_tracks() -> None:
+    """Tracks of the built-in tracker on tiny images ask for a lens where there is none."""
+    tiny = SyntheticSceneConfig(num_frames=8, height=120, width=160, focal=150.0, grid_columns=14, grid_rows=10)
+    sequence = dataclasses.replace(make_synthetic_sequence(tiny), tracks=None)
+    settings = config()
+    given = label_tracks(load_or_track(sequence, settings.tracking, None), sequence, settings.labels, settings.input)
+    found = calibrate_lens(given, sequence.image_size, sequence.intrinsics, settings)
+    assert found.candidates[0].evidence > settings.camera.min_evidence
+    assert found.candidates[0].held_out_gain < 0.0
+    assert found.lens == PINHOLE

@@ -3,7 +3,8 @@
 Part of the tracks and frames serve. The test compares nested models: by which part of itself does the reprojection
 energy fall when the distortion is set free at the pinhole's minimum? A plain likelihood ratio says yes too soon, as a
 tracker errs alike along a track and between neighbors; such errors do not reach a fixed part of the energy. Held-out
-tracks are reported, but do not decide: free poses bend so far that a wrong lens explains them nearly as well.
+tracks decide on small distortions only, which errors of a tracker may mimic: free poses bend so far that a wrong lens
+explains them nearly as well, and a large one that is right may explain them worse.
 
 Focal length and distortion trade against each other along a narrow valley, in which a pinhole ends far from the truth
 (its focal length 30 % off where k1 is -0.12). The search therefore starts from several distortions, each undone before
@@ -136,6 +137,9 @@ def calibrate_lens(
         if candidate.evidence < settings.min_evidence:
             break
         if not settings.min_displacement_px < candidate.displacement_px < np.inf:
+            break
+        is_small = candidate.displacement_px < settings.sure_displacement * max(image_size)
+        if is_small and candidate.held_out_gain <= 0.0:
             break
         best = found
     if best is pinhole:
