@@ -42,6 +42,12 @@ class TrackingConfig(Section):
     max_refinement_px: float = setting(
         0.5, "The same if the first view is found farther than this from where the step leads, px.", gt=0
     )
+    bridge_frames: int = setting(
+        0,
+        "Points that something hides together with those around them are looked for again behind it, for this many "
+        "frames, and keep their tracks: 25 bridges an occlusion of 15. 0: what is lost stays lost.",
+        ge=0,
+    )
     max_drift_px: float | None = setting(
         None,
         "Largest distance between a point and where its first appearance is found, px; null: not checked. The check "

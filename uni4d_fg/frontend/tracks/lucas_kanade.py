@@ -5,11 +5,11 @@ the video follow them: one forwards, in which every grid joins as the sweep pass
 backwards. A step moves all live points of all grids at once, however many grids there are, and then finds their first
 views (:mod:`uni4d_fg.frontend.tracks.first_views`), so that its errors do not add up; without refinement the step is
 checked backwards, and optionally for drift. Only the two images of the step are held, the first views of live points,
-and for the drift check their gray query images.
+some images of the last steps for what was hidden, and for the drift check the gray query images.
 
-A point that fails a check of :mod:`uni4d_fg.frontend.tracks.optical_flow` is lost, and not looked for again. Where the
-forward sweep leaves a cell of the image empty between two grids, a new point starts
-(:mod:`uni4d_fg.frontend.tracks.reseeding`), and is followed both ways as well.
+A point that fails a check of :mod:`uni4d_fg.frontend.tracks.optical_flow` is lost. What was hidden can be looked for
+again (:mod:`uni4d_fg.frontend.tracks.bridging`). Where the forward sweep leaves a cell of the image empty between two
+grids, a new point starts (:mod:`uni4d_fg.frontend.tracks.reseeding`), and is followed both ways as well.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.tracks.bridging import Bridges
 from uni4d_fg.frontend.tracks.first_views import FirstViews, refines
 from uni4d_fg.frontend.tracks.optical_flow import has_not_drifted, move_points
 from uni4d_fg.frontend.tracks.reseeding import corners_of_empty_cells
@@ -135,6 +136,8 @@ class _LivePoints:
     """Where the points started, and the image there; only for the drift check."""
     views: FirstViews | None = None
     """Of the points, if they are refined."""
+    bridges: Bridges | None = None
+    """The points that were lost from sight, if they are looked for."""
 
     def start(self, queries: _Queries, image: ImageArray, config: TrackingConfig) -> None:
         """Add points in the frame where they start."""
@@ -156,6 +159,8 @@ class _LivePoints:
         else:
             kept, self.points = self.views.follow(source, target, self.points)
         self.track = self.track[kept]
+        if config.bridge_frames:
+            self._bridge(target, config)
         if config.max_drift_px is None:
             return
         keep = np.ones(len(self.track), np.bool_)
@@ -170,6 +175,18 @@ class _LivePoints:
         self.track, self.points = self.track[keep], self.points[keep]
         if self.views is not None:
             self.views.select(keep)
+
+    def _bridge(self, image: ImageArray, config: TrackingConfig) -> None:
+        """Take up points that are in sight again."""
+        if self.bridges is None:
+            self.bridges = Bridges(config)
+        again, where = self.bridges.find(image, self.track, self.points)
+        if len(again) == 0:
+            return
+        self.track = np.concatenate((self.track, again))
+        self.points = np.concatenate((self.points, where))
+        if self.views is not None:
+            self.views.add(image, where)
 
 
 def _gray(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> ImageArray:
