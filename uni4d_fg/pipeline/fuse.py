@@ -178,6 +178,8 @@ class DenseMaps:
     """The same of single frames ..."""
     tried: list[float] = field(default_factory=list)
     """... and the error of matched depth at landmarks over that of the cue."""
+    untold: bool = False
+    """The cue was made from landmarks, which then do not judge it: matching counts if the cue bleeds."""
     told: ToldError = field(default_factory=ToldError)
     """Of the frames that are done."""
     made: dict[int, tuple[StaticDepth, Float32Array]] = field(default_factory=dict)
@@ -199,7 +201,7 @@ class DenseMaps:
         bled = float(np.median(self.bled)) if self.bled else 0.0
         self.bleeding_px = bled if bled > _SHARP_PX else 0.0
         limit = self._limit()
-        return any(error < limit for error in self.tried) or bool(self.broken)
+        return any(error < limit for error in self.tried) or bool(self.broken) or (self.untold and self.bleeding_px > 0)
 
     def _limit(self) -> float:
         """Return the error of matched depth at landmarks, over that of the cue, below which it is used."""
@@ -342,7 +344,9 @@ class DenseMaps:
             errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config)
             if self.bleeding_px is None:
                 self.tried.append(errors.matching)
-            if not errors.matching < self._limit():
+                self.untold |= not errors.telling
+            bleeds = self.bleeding_px is None or self.bleeding_px > 0
+            if not (errors.matching < self._limit() or (bleeds and not errors.telling)):
                 measured = None
             self.matched += measured is not None
             if measured is not None and self.bleeding_px == 0:

@@ -95,8 +95,11 @@ def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(
     for error, better in ((0.005, True), (0.1, False)):
         seen = np.exp(truth + error * rng.standard_normal(truth.shape)).astype(np.float32)
         measured = Measured(seen, np.full(depth.shape, 0.95, np.float32), sigma)
-        ratio = held_out_errors(noisy, measured, uv, log_z, static, 0.0, FusionConfig()).matching
-        assert (ratio < 0.8) is better, ratio
+        judged = held_out_errors(noisy, measured, uv, log_z, static, 0.0, FusionConfig())
+        assert (judged.matching < 0.8) is better, judged
+        assert judged.telling
+        if better:  # landmarks that a cue was made from agree with it wherever they are held out
+            assert not held_out_errors(depth, measured, uv, log_z, static, 0.0, FusionConfig()).telling
     found = held_out_errors(noisy, None, uv, log_z, static, 0.0, FusionConfig())
     known = known_depth(None, uv, log_z, static, (HEIGHT, WIDTH))
     fused = fuse_static(noisy, None, known, found.cue, static, NOWHERE, 0.0, 0.0, FusionConfig())

@@ -26,6 +26,8 @@ _MEAN_TO_SIGMA = 1.2533
 _FITTED_ERROR = 1.2
 """Its error over that at landmarks beside those that it was fitted to, on scenes with truth."""
 _LEAST_ERROR = 1e-5
+_OWN_SOURCE = 0.0025
+"""Landmarks are off by more than this themselves."""
 _TRACKED_PX = 5
 """Half a tracking window, working px."""
 _MIN_COMPARED = 20
@@ -208,6 +210,8 @@ class HeldOut(NamedTuple):
     """Of the cue that the other landmarks have corrected, everywhere; of the true error, as far as it is known."""
     matching: float
     """Of matched depth where it is sure, over that of the cue there; NaN without any."""
+    telling: bool
+    """False if landmarks agree with the cue better than they agree with the truth: it was made from them."""
 
 
 def held_out_errors(
@@ -245,11 +249,13 @@ def held_out_errors(
     compared = (judges.weight > 0) & np.isfinite(corrected)
     of_cue = _FITTED_ERROR * mean_error(corrected, compared)
     if measured is None:
-        return HeldOut(of_cue, float("nan"))
+        return HeldOut(of_cue, float("nan"), True)
     # Tracking windows reach across edges: landmarks beside them bleed as a cue does.
     beside = cv2.dilate(_beside_edges(measured).astype(np.uint8), np.ones((2 * _TRACKED_PX + 1,) * 2, np.uint8)) > 0
     sure = compared & ~beside & (measured.confidence > _SURE)
-    return HeldOut(of_cue, mean_error(np.log(measured.depth), sure) / max(mean_error(corrected, sure), _LEAST_ERROR))
+    error = mean_error(corrected, sure)
+    ratio = mean_error(np.log(measured.depth), sure) / max(error, _LEAST_ERROR)
+    return HeldOut(of_cue, ratio, not error < _OWN_SOURCE)
 
 
 def without_edges(measured: Measured, cue: Float32Array) -> Measured:
