@@ -164,3 +164,13 @@ def test_a_wall_seen_frontally_leaves_zoom_and_motion_open() -> None:
     plain = calibrated(scene(seed=1)).zoom
     assert plain is not None
     assert not plain.warnings
+
+
+@pytest.mark.slow
+def test_a_zoom_on_the_way_straight_forward_is_doubted() -> None:
+    forward = make_synthetic_sequence(SyntheticSceneConfig(path="forward", render_images=False))
+    for sequence, doubted in ((forward, True), (scene(), False)):
+        found = calibrated(zoom_sequence(sequence, ramp(sequence.num_frames))).zoom
+        assert found is not None
+        assert found.zoom is not None
+        assert any("hardly determine its focal length" in warning for warning in found.warnings) == doubted

@@ -66,6 +66,8 @@ def find_zoom(work: ZoomFit, scene: StaticScene, num_frames: int, config: Camera
     if config.zoom == "auto" and (found.evidence < config.min_zoom_evidence or span < config.min_zoom):
         note += f" and varies by {100 * span:.1f} % only"
         return ZoomCalibration(None, scene.cameras.intrinsics, found.evidence, _spread(found), (note,), warnings)
+    if not found.focal_sigma <= _FOCAL_OPEN:
+        warnings += (_FOCAL_IS_OPEN,)
     focal = found.intrinsics[0] * np.exp(np.interp(np.arange(num_frames), work.frames, found.zoom))
     said = f"the camera zooms: fx from {focal.min():.1f} to {focal.max():.1f} px"
     return ZoomCalibration(
@@ -78,6 +80,10 @@ _PROBED = 0.4
 
 _OPEN = 0.03
 """Standard deviation of the log focal length from which it counts as open."""
+
+_FOCAL_OPEN = 0.08
+"""Standard deviation of the log focal length of a camera that zooms from which little tells its zoom from motion."""
+_FOCAL_IS_OPEN = "the camera zooms, and tracks hardly determine its focal length: the zoom and the path may be off too"
 
 
 def _spread(fit: FittedZoom) -> float:

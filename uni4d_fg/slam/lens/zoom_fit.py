@@ -35,6 +35,8 @@ class FittedZoom:
     """Part of the reprojection energy that was lost when the zoom was set free."""
     sigma: FloatArray | None
     """(F,) standard deviation of the zoom relative to the first frame; None where nothing is known of it."""
+    focal_sigma: float
+    """Standard deviation of the log focal length of the first frame; NaN where nothing is known of it."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,10 @@ class ZoomFit:
         marginals = camera_marginals(stage.problem, state, solver)
         sigma = None if marginals is None else np.sqrt(marginals.blocks(ZOOM, len(self.frames))[:, 0, 0])
         zoom, intrinsics = state[ZOOM][:, 0], state[INTRINSICS][0].copy()
+        focal = np.nan if marginals is None else np.sqrt(marginals.blocks(INTRINSICS, 1)[0, 0, 0]) / intrinsics[0]
         longest = float(zoom.max())
         intrinsics[:2] *= np.exp(longest)
-        return FittedZoom(zoom - longest, intrinsics, gain / max(before, 1e-300), sigma)
+        return FittedZoom(zoom - longest, intrinsics, gain / max(before, 1e-300), sigma, float(focal))
 
     def _problem(self, scene: StaticScene) -> tuple[Problem, State]:
         """Return bundle adjustment of a scene with the zoom in place of one focal length."""
