@@ -45,4 +45,4 @@ def test_what_is_printed_without_the_untouched_advanced_fields_reads_back_the_sa
     config = load_config(name, ["nonrigid.solver.relative_decrease=1e-5", "camera_init.window=6"])
     (tmp_path / "mine.yaml").write_text(commented_yaml(basic_fields(config)), encoding="utf-8")
     assert load_config(tmp_path / "mine.yaml") == config
-    assert len(basic_fields(load_config("default"))) < 70
+    assert len(basic_fields(load_config("default"))) <= 70

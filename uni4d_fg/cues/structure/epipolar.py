@@ -7,11 +7,11 @@ tracks than the room. No focal length is needed.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.structure.consensus import fundamental_matrix
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.selection import picture_cells
 from uni4d_fg.slam.stages.observations import Observations
@@ -58,10 +58,8 @@ def _distances(
     used = _balanced(cell, max(1, min(config.epipolar_per_cell, usual)))
     if len(used) < _MIN_PAIRS:
         return None
-    matrix, _ = cv2.findFundamentalMat(
-        first[used], second[used], cv2.USAC_MAGSAC, config.epipolar_px, _CONFIDENCE, config.two_view_trials
-    )
-    if matrix is None or matrix.shape != (3, 3):
+    matrix = fundamental_matrix(first[used], second[used], config.epipolar_px, _CONFIDENCE, config.two_view_trials)
+    if matrix is None:
         return None
     a, b = (np.concatenate([uv, np.ones((len(uv), 1))], axis=1) for uv in (first, second))
     line, back = a @ matrix.T, b @ matrix

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.cues.structure.consensus import essential_matrix
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, unproject
 
@@ -102,19 +103,13 @@ def relative_pose(
     if len(uv_first) < 8:
         return None
     rays = [unproject(intrinsics, uv, np.ones(len(uv)))[:, :2] for uv in (uv_first, uv_second)]
-    essential, mask = cv2.findEssentialMat(
-        rays[0],
-        rays[1],
-        np.eye(3),
-        method=cv2.USAC_MAGSAC,
-        prob=_CONFIDENCE,
-        threshold=threshold_px / float(np.mean(intrinsics[:2])),
-        maxIters=max_trials,
-    )
-    if essential is None or essential.shape != (3, 3):
+    found = essential_matrix(rays[0], rays[1], threshold_px / float(np.mean(intrinsics[:2])), _CONFIDENCE, max_trials)
+    if found is None:
         return None
+    essential, agrees = found
     # The mask is changed in place: what lies behind a camera, or too far away to tell, goes out.
-    count, rotation, translation, mask = cv2.recoverPose(essential, rays[0], rays[1], np.eye(3), mask=mask.copy())
+    agreeing = agrees[:, None].astype(np.uint8)
+    count, rotation, translation, mask = cv2.recoverPose(essential, rays[0], rays[1], np.eye(3), mask=agreeing)
     if count < 8:
         return None
     second_T_first = np.eye(4)

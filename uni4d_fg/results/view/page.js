@@ -17,13 +17,19 @@
     // wide the screen is may not be known yet: where there is no such panel, nothing is found.
     const sheet = () => [...document.querySelectorAll('div[style*="max-height: 60%"]')].find(
       (div) => div.style.position === "fixed" && div.style.bottom === "0px");
-    // The panel is made anew when settings arrive, and then begins open again; a finger opens and closes the same one.
-    const closed = new WeakSet();
+    // The panel is made anew when settings arrive, and then begins open again, or as closed as it was; a finger opens and
+    // closes the same one.
+    const left = new WeakSet();
+    const grip = () => sheet()?.querySelector('div[style*="cursor: pointer"]');
     new MutationObserver(() => {
-      const handle = sheet()?.querySelector('div[style*="cursor: pointer"]');
-      if (!handle || closed.has(handle)) return;
-      closed.add(handle);
+      const handle = grip();
+      if (!handle || left.has(handle) || sheet().offsetHeight < 0.2 * window.innerHeight) return;
+      left.add(handle);
       handle.click();
     }).observe(document.body, { childList: true, subtree: true });
+    document.addEventListener("pointerdown", (event) => {
+      const handle = grip();
+      if (handle?.contains(event.target)) left.add(handle);
+    }, true);
   });
 })();
