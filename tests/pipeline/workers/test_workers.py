@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worker_samples import square_or_die
+from worker_samples import page_faults, square_or_die
 
 from uni4d_fg import optional
 from uni4d_fg.errors import Cancelled, ConfigError, InputError, MissingDependencyError
@@ -54,6 +55,13 @@ def test_tasks_that_die_hang_or_raise_cost_the_others_nothing(client: Any, tmp_p
     assert "its process died 2 times" in found[4].why
     assert attempts(tmp_path, 6) == [1, 2, 1, 2, 2, 1]
     assert not (tmp_path / "3.hang.txt").exists()  # it came through at last
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc's allocator")
+def test_large_arrays_are_not_mapped_anew_each_time(client: Any) -> None:
+    faults = client.gather([client.submit(page_faults, 200, pure=False) for _ in range(2)])
+    # 200 arrays of 4 MB are 204,800 pages.
+    assert max(faults) < 20_000
 
 
 def test_one_that_hangs_again_and_again_is_given_up_and_says_where_it_was(client: Any, tmp_path: Path) -> None:

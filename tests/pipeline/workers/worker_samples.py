@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import time
 from pathlib import Path
@@ -18,6 +19,14 @@ from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.stage_graph import RecordingRunner, StageGraph
 from uni4d_fg.optim.threads import thread_count
+
+
+def page_faults(count: int) -> int:
+    """Return how many page faults it costs to make and drop so many arrays of 4 MB."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(count):
+        np.ones(1 << 19)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 
 def square_or_die(item: tuple[int, str, Path]) -> tuple[int, int, int]:
