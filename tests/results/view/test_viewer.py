@@ -322,6 +322,16 @@ def test_notes_reach_the_panel(finished_run: Path, tmp_path: Path) -> None:
     assert "labels.npz" in notes
 
 
+def test_a_connection_that_asks_for_nothing_prints_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    port = free_port()
+    with viewer_server("127.0.0.1", port, "a run"):
+        for sent in (b"", b"GET / HT", b"nonsense\r\n\r\n"):
+            with socket.create_connection(("127.0.0.1", port), timeout=5.0) as connection:
+                connection.sendall(sent)
+        time.sleep(0.5)
+    assert caplog.records == []
+
+
 HOSTILE = (
     "<iframe srcdoc=\"<script>parent.document.title='taken'</script>\"></iframe>"
     '<img src=x onerror="alert(1)">{alert(1)}'

@@ -7,6 +7,7 @@ import http
 import inspect
 import io
 import ipaddress
+import logging
 import socket
 from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
@@ -121,6 +122,10 @@ def viewer_server(host: str, port: int, title: str) -> Iterator[Any]:
     """
     viser = import_viser()
     check_address(host, port)
+    # A connection that is opened and not used, as scans of ports do, is no error of the user's.
+    logger = logging.getLogger("websockets.server")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
     # viser announces itself and its end on standard output, which is for results.
     with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
@@ -133,3 +138,4 @@ def viewer_server(host: str, port: int, title: str) -> Iterator[Any]:
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
+        logger.setLevel(level)
