@@ -98,8 +98,8 @@ def test_every_writer_fails_cleanly_and_the_run_goes_on_where_it_was(
     values = [f"{kind}.{end}.values" for kind in kinds for end in ("initial", "final")]
     views = ["static.ply", *(f"{t:05d}.ply" for t in range(4))]
     assert failed == [
-        "run.json", "config.yaml", "labels.npz", *stages, "depth.npy", "fusion.npz", "reconstruction.npz",
-        "trajectory.tum", *views, *values, "summary.json",
+        "run.json", "config.yaml", "labels.npz", *stages, "confidence.npy", "depth.npy", "fusion.npz",
+        "reconstruction.npz", "trajectory.tum", *views, *values, "summary.json",
     ]  # fmt: skip
 
 
