@@ -17,20 +17,13 @@
     // wide the screen is may not be known yet: where there is no such panel, nothing is found.
     const sheet = () => [...document.querySelectorAll('div[style*="max-height: 60%"]')].find(
       (div) => div.style.position === "fixed" && div.style.bottom === "0px");
-    // The panel is made anew when settings arrive, and then begins open again; a click while it is made may be lost. So it
-    // is looked at until it has stayed closed for some seconds, or a finger has taken it.
-    const grip = () => sheet()?.querySelector('div[style*="cursor: pointer"]');
-    let rest = 0, closed = 0, taken = false;
-    document.addEventListener("pointerdown", (event) => { taken ||= Boolean(grip()?.contains(event.target)); }, true);
-    const timer = setInterval(() => {
-      const open = (sheet()?.offsetHeight ?? 0) > 0.2 * window.innerHeight;
-      closed = open ? 0 : closed + 1;
-      rest -= 1;
-      if (taken || closed > 40) clearInterval(timer);
-      else if (open && rest <= 0) {
-        grip()?.click();
-        rest = 20;  // closing takes seconds where pictures do
-      }
-    }, 250);
+    // The panel is made anew when settings arrive, and then begins open again; a finger opens and closes the same one.
+    const closed = new WeakSet();
+    new MutationObserver(() => {
+      const handle = sheet()?.querySelector('div[style*="cursor: pointer"]');
+      if (!handle || closed.has(handle)) return;
+      closed.add(handle);
+      handle.click();
+    }).observe(document.body, { childList: true, subtree: true });
   });
 })();
