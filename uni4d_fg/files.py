@@ -52,6 +52,14 @@ def write_failure(path: Path, error: OSError) -> OutputError:
     return OutputError(f"cannot write {path}: {reason}; {remedy}")
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file, if it is there. Raises OutputError if it cannot be removed."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise write_failure(path, error) from error
+
+
 def temporary_sibling(path: Path) -> Path:
     """Return an unused hidden path in the folder of ``path`` that ends in the same name (and suffix)."""
     return path.with_name(f".tmp-{secrets.token_hex(4)}-{path.name}")
@@ -209,11 +217,6 @@ def load_checksums(path: Path) -> npt.NDArray[np.uint32] | None:
     return numbers[1:].astype(np.uint32) if whole else None
 
 
-def _deflated(path: Path) -> zipfile.ZipFile:
-    """Open a zip file to write; at level 3 measurements end 4 % larger than at the usual 6, in a third of the time."""
-    return zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=3)
-
-
 def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
     """Write named arrays to a compressed ``.npz``, whole or not at all.
 
@@ -225,7 +228,11 @@ def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
     for name, array in plain.items():
         if array.dtype.hasobject:
             raise ValueError(f"{path}: {name!r} is an object array and cannot be saved without pickle")
-    with atomic_path(path) as temporary, _deflated(temporary) as archive:
+    with (
+        atomic_path(path) as temporary,
+        # At level 3 measurements end 4 % larger than at the usual 6, in a third of the time.
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=3) as archive,
+    ):
         for name, array in plain.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
                 np.lib.format.write_array(stream, array, allow_pickle=False)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from uni4d_fg.errors import InputError
-from uni4d_fg.results.confidence_store import read_confidence, remove_confidence, write_confidence
+from uni4d_fg.files import remove_file
+from uni4d_fg.results.confidence_store import read_confidence, write_confidence
 
 
 def test_maps_come_back_to_half_a_step_at_the_size_of_the_images(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -24,8 +25,8 @@ def test_maps_come_back_to_half_a_step_at_the_size_of_the_images(tmp_path: Path,
     large = read_confidence(path, (24, 32))[1]
     assert large.shape == (24, 32)
     np.testing.assert_allclose(large.mean(), maps[1].mean(), atol=0.03)
-    remove_confidence(path)
-    remove_confidence(path)
+    remove_file(path)
+    remove_file(path)
     assert not path.exists()
 
 

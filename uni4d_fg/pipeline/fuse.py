@@ -13,6 +13,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.files import remove_file
 from uni4d_fg.frontend.sequence.frames import FramesInTurn
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import some_of
@@ -23,7 +24,7 @@ from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.progress import Reporter
-from uni4d_fg.results.confidence_store import remove_confidence, write_confidence
+from uni4d_fg.results.confidence_store import write_confidence
 from uni4d_fg.results.depth_store import write_depth
 from uni4d_fg.results.fusion.averaging import average_over_frames
 from uni4d_fg.results.fusion.bleeding import bleeding_radius
@@ -117,7 +118,7 @@ def fuse_depth(
         unmatched = "adds nothing to this cue, as landmarks say"
     # Anew, as the frames that were tried are not in order.
     maps = replace(maps, unmatched=unmatched, bleeding_px=maps.bleeding_px or 0.0, matched=0, made={})
-    remove_confidence(folder.confidence)
+    remove_file(folder.confidence)
     with ExitStack() as files:
         writer = files.enter_context(write_depth(folder.depth, sequence.num_frames, sequence.image_size))
         working = maps.size.height, maps.size.width

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from uni4d_fg.files import write_failure
+from uni4d_fg.files import remove_file
 from uni4d_fg.optim.problem_io import load_stage_graph
 from uni4d_fg.results.run_folder import RunFolder
 
@@ -32,10 +32,7 @@ def remove_graphs(folder: RunFolder, step: str) -> None:
         kinds = kinds[1:]
     for kind in kinds:
         for path in (folder.graph(kind), *(folder.graphs / f"{kind}.{end}.values" for end in ("initial", "final"))):
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:
-                raise write_failure(path, error) from error
+            remove_file(path)
 
 
 def write_graph_values(folder: RunFolder) -> dict[str, dict[str, int]]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from uni4d_fg.files import write_failure
+from uni4d_fg.files import remove_file
 from uni4d_fg.results import run_contents
 from uni4d_fg.results.run_folder import RunFolder
 
@@ -16,7 +14,7 @@ def remove_leftovers(folder: RunFolder) -> None:
         OutputError: If one cannot be removed.
     """
     run_contents.remove_leftovers(folder.root)
-    _remove(folder.summary)
+    remove_file(folder.summary)
 
 
 def remove_views(folder: RunFolder) -> None:
@@ -28,11 +26,4 @@ def remove_views(folder: RunFolder) -> None:
     dynamic = folder.dynamic_cloud(0).parent
     pictures = (folder.trajectory_picture, folder.depth_picture, folder.scene_picture)
     for path in (folder.static_cloud, *sorted(dynamic.glob("[0-9]*.ply")), *pictures):
-        _remove(path)
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_failure(path, error) from error
+        remove_file(path)

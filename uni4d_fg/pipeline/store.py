@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import load_npz, save_npz, write_failure
+from uni4d_fg.files import load_npz, remove_file, save_npz
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,7 @@ class StageStore:
         Raises:
             OutputError: If it cannot be removed.
         """
-        try:
-            self.path(name).unlink(missing_ok=True)
-        except OSError as error:
-            raise write_failure(self.path(name), error) from error
+        remove_file(self.path(name))
 
     def save(self, name: str, key: str, record: StageRecord) -> None:
         """Write a stage's record, whole or not at all.

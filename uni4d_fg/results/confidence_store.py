@@ -16,7 +16,7 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import atomic_path, load_npy, write_failure
+from uni4d_fg.files import atomic_path, load_npy
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 
 _STEPS = 255
@@ -74,14 +74,6 @@ class StoredConfidence(ArrayFrames):
 
     def __iter__(self) -> Iterator[Float32Array]:
         return (self[frame] for frame in range(len(self)))
-
-
-def remove_confidence(path: Path) -> None:
-    """Forget what an earlier fusion said. Raises OutputError if it cannot be removed."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_failure(path, error) from error
 
 
 def read_confidence(path: Path, image_size: tuple[int, int]) -> StoredConfidence:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from uni4d_fg.errors import InputError, OutputError
-from uni4d_fg.files import atomic_write_json, write_failure
+from uni4d_fg.files import atomic_write_json, remove_file, write_failure
 from uni4d_fg.reading import read_json
 
 try:
@@ -81,10 +81,10 @@ def is_free(root: Path) -> bool:
 def remove_leftovers(root: Path) -> None:
     """Remove temporary files that a killed run could not remove. Raises OutputError."""
     for path in list(_files(root, temporary=True)):
-        _remove(path)
+        remove_file(path)
     for path in list(_below(root / "cues")):
         if _TEMPORARY.fullmatch(path.name):
-            _remove(path)
+            remove_file(path)
 
 
 def remove_results(root: Path) -> None:
@@ -98,7 +98,7 @@ def remove_results(root: Path) -> None:
     remove_leftovers(root)
     for path in list(_files(root, temporary=False)):
         if path.name != MARKER:
-            _remove(path)
+            remove_file(path)
     for path in sorted((root / "export").iterdir()) if _is_own_folder(root / "export") else ():
         if is_export(path):
             remove_export(path)
@@ -106,7 +106,7 @@ def remove_results(root: Path) -> None:
         if re.fullmatch(r"\d{3,}", path.name) and _is_own_folder(path) and is_run(path):
             remove_results(path)
             if [own.name for own in path.iterdir()] == [MARKER]:
-                _remove(path / MARKER)
+                remove_file(path / MARKER)
             _remove_if_empty(path)
     for name in (*sorted(filter(None, _KNOWN), reverse=True), "export", "shots"):
         _remove_if_empty(root / name)
@@ -136,7 +136,7 @@ def remove_export(folder: Path) -> None:
     own = _listed(folder)
     for name in export_files(folder):
         if name in own:
-            _remove(folder / name)
+            remove_file(folder / name)
     for path in sorted((p for p in folder.rglob("*") if _is_own_folder(p)), reverse=True):
         _remove_if_empty(path)
     _remove_if_empty(folder)
@@ -233,10 +233,3 @@ def _remove_if_empty(folder: Path) -> None:
             folder.rmdir()
     except OSError as error:
         raise write_failure(folder, error) from error
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_failure(path, error) from error

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array
+from uni4d_fg.results.fusion.log_range import log_range
 
 _EDGE = 0.15
 """Change of log depth over two pixels that is an edge."""
@@ -18,8 +19,6 @@ _LEAST = 0.02
 _MIN_PIXELS = 30
 _FARTHEST_MIXED = 5.0
 """The mixture is wrong nearer to an edge than this, working px; what bleeds farther is right to some percent."""
-_BEYOND = 99.0
-"""Beyond all log depths."""
 _RAMP = 0.12
 """Change of log depth across which a cue that bleeds is a mixture."""
 
@@ -69,10 +68,7 @@ def across_edges(log_cue: Float32Array, radius_px: float) -> BoolArray:
     """
     side = 2 * round(min(radius_px, _FARTHEST_MIXED)) + 1
     window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    known = np.isfinite(log_cue)
-    farthest = cv2.dilate(np.where(known, log_cue, np.float32(-_BEYOND)), window)
-    nearest = cv2.erode(np.where(known, log_cue, np.float32(_BEYOND)), window)
-    return np.asarray(farthest - nearest > _RAMP)
+    return np.asarray(log_range(log_cue, np.asarray(window, np.uint8)) > _RAMP)
 
 
 def from_nearest(values: Float32Array, known: BoolArray) -> Float32Array:

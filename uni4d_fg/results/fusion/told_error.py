@@ -11,18 +11,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.results.fusion.averaging import Averaged
+from uni4d_fg.results.fusion.log_range import log_range
 
 _WEIGHTS = np.array([-2.2, 0.554, 3.029, 0.499, -2.556], dtype=np.float32)
 _MANY_FRAMES = 4
 _EDGE_WINDOW = np.ones((5, 5), np.uint8)
 _STEEPEST = 0.3
-_BEYOND = 99.0
-"""Beyond all log depths."""
 _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
 _SURE_ERROR, _WRONG_ERROR = 0.0025, 0.08
 """Mean error at a probability of 1, and what a lower one adds per unit."""
@@ -38,9 +36,7 @@ def final_confidence(alone: Float32Array, averaged: Averaged) -> Float32Array:
     """
     log_depth = np.log(averaged.depth)
     missing = ~np.isfinite(log_depth)
-    far = cv2.dilate(np.where(missing, np.float32(-_BEYOND), log_depth), _EDGE_WINDOW)
-    near = cv2.erode(np.where(missing, np.float32(_BEYOND), log_depth), _EDGE_WINDOW)
-    steep = np.where(missing, 0, np.clip(far - near, 0, _STEEPEST))
+    steep = np.where(missing, 0, np.clip(log_range(log_depth, _EDGE_WINDOW), 0, _STEEPEST))
     bounded = np.clip(alone, 1e-3, 1 - 1e-3)
     share = averaged.alike / np.maximum(averaged.seeing, 1)
     seen = np.minimum(averaged.seeing, _MANY_FRAMES) / _MANY_FRAMES

@@ -72,20 +72,20 @@ def close_path(path: Finished, old: FloatArray, covariance: FloatArray, closing:
     frames, variance = np.arange(len(old)), _step_variance(old, covariance)
     if variance is None:
         return None
-    steps = se3.inverse(old[:-1]) @ old[1:]
+    chain, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    chain.addPriorPose3(POSE.key(0), gtsam.Pose3(old[0]), gtsam.noiseModel.Isotropic.Sigma(6, _HELD))
+    for t, pose in enumerate(old):
+        values.insert(POSE.key(t), gtsam.Pose3(pose))
+    for t, step in enumerate(se3.inverse(old[:-1]) @ old[1:]):
+        noise = gtsam.noiseModel.Diagonal.Variances(variance[t])
+        chain.add(gtsam.BetweenFactorPose3(POSE.key(t), POSE.key(t + 1), gtsam.Pose3(step), noise))
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setMaxIterations(200)
+    settings.setRelativeErrorTol(1e-9)
     while (source := closing.source()) is not None:
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.addPriorPose3(POSE.key(0), gtsam.Pose3(old[0]), gtsam.noiseModel.Isotropic.Sigma(6, _HELD))
-        for t, pose in enumerate(old):
-            values.insert(POSE.key(t), gtsam.Pose3(pose))
-        for t, step in enumerate(steps):
-            noise = gtsam.noiseModel.Diagonal.Variances(variance[t])
-            graph.add(gtsam.BetweenFactorPose3(POSE.key(t), POSE.key(t + 1), gtsam.Pose3(step), noise))
+        graph = gtsam.NonlinearFactorGraph(chain)
         for factor in source.factors(frames):
             graph.add(factor)
-        settings = gtsam.LevenbergMarquardtParams()
-        settings.setMaxIterations(200)
-        settings.setRelativeErrorTol(1e-9)
         found = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
         new = np.stack([found.atPose3(POSE.key(t)).matrix() for t in frames.tolist()])
         if closing.judge(new):

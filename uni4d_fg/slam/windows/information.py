@@ -38,14 +38,14 @@ class WindowInformation:
     def columns(self, num_frames: int) -> IntArray:
         """Return the place (n,) of its columns among those of all frames."""
         frames = np.arange(FRAME * self.window.start, FRAME * self.window.stop)
-        return np.concatenate([frames, FRAME * num_frames + np.arange(4)])
+        return np.concatenate([frames, FRAME * num_frames + np.arange(SHARED)])
 
     def difference(self, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
         """Return d (n,) and its Jacobian (n, n) with respect to the shared cameras' tangents."""
         here, count = cameras.part(self.window.start, self.window.stop), len(self.window)
         twist = se3_log(se3.inverse(self.point.world_T_cam) @ here.world_T_cam)
         inverse_jacobian = inverse_right_jacobian(twist)
-        d, jacobian = np.zeros(FRAME * count + 4), np.eye(FRAME * count + 4)
+        d, jacobian = np.zeros(FRAME * count + SHARED), np.eye(FRAME * count + SHARED)
         for i in range(count):
             own = slice(FRAME * i, FRAME * i + 6)
             d[own] = twist[i]
@@ -54,5 +54,5 @@ class WindowInformation:
                 back = se3.adjoint(se3.inverse(here.world_T_cam[i]))
                 jacobian[own, :6] = -inverse_jacobian[i] @ back
         d[6 : FRAME * count : FRAME] = here.log_scale - self.point.log_scale
-        d[-4:] = here.intrinsics - self.point.intrinsics
+        d[-SHARED:] = here.intrinsics - self.point.intrinsics
         return d, jacobian
