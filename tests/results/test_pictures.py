@@ -16,9 +16,9 @@ from uni4d_fg.errors import OutputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.geometry import se3
 from uni4d_fg.results.pictures import draw_depth_strip, draw_scene, draw_trajectory, trajectory
-from uni4d_fg.results.pictures.figure import spread_frames, upright_axes
+from uni4d_fg.results.pictures.figure import Collage, spread_frames, upright_axes
 from uni4d_fg.results.pictures.scene import times_of_the_subject
-from uni4d_fg.results.pictures.splatting import View, look_at, render
+from uni4d_fg.results.pictures.splatting import View, _edge_shading, look_at, render
 from uni4d_fg.slam.reconstruction import Reconstruction
 
 
@@ -152,6 +152,41 @@ def test_look_at_and_upright_axes() -> None:
     assert pose[1, 1] > 0.9  # image down is world down
     axes = upright_axes(camera_path(4))
     np.testing.assert_allclose(axes, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+
+
+def test_a_collage_keeps_the_pixels_of_pictures_and_is_drawn_over(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    collage = Collage(100, 80)
+    panel = collage.add_picture(image, 30, 20)
+    expected = np.full((80, 100, 3), 255, np.uint8)
+    expected[20:60, 30:90] = image
+    np.testing.assert_array_equal(collage.pixels(), expected)
+
+    # A half-transparent square over whole pixels: units of the axes are pixels, of the picture's first one at 0.
+    panel.fill(
+        [9.5, 19.5, 19.5, 9.5], [4.5, 4.5, 14.5, 14.5], color=(1.0, 0.0, 0.0, 0.5), linewidth=0, antialiased=False
+    )
+    drawn = collage.pixels().astype(int)
+    inside = (slice(25, 35), slice(40, 50))
+    half = 0.5 * expected[inside] + 0.5 * np.array([255.0, 0.0, 0.0])
+    assert np.abs(drawn[inside] - half).max() <= 2
+    drawn[inside] = expected[inside]
+    np.testing.assert_array_equal(drawn, expected)
+
+    collage.save(tmp_path / "collage.png")
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "collage.png"))[..., ::-1], collage.pixels())
+
+
+def test_edges_are_darkened_behind_what_is_in_front_and_not_beside_nothing() -> None:
+    depth = np.full((20, 30), np.inf)
+    depth[4:16, 3:27] = 2.0
+    depth[8:12, 10:20] = 1.0
+    shade = _edge_shading(depth, 1.0)
+    assert shade[9, 15] == 1.0  # in front
+    assert shade[4, 3] == 1.0  # beside nothing
+    # Two of the eight neighbors, one pixel and three pixels away, are in front, and each darkens as much as one may.
+    assert shade[9, 20] == pytest.approx(np.exp(-0.4), rel=1e-6)
+    assert shade[9, 22] == pytest.approx(np.exp(-0.2), rel=1e-6)
 
 
 def test_frames_are_spread() -> None:

@@ -15,6 +15,7 @@ from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.geometry.trajectory import Trajectory
+from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.pipeline.leftovers import remove_views
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.clouds import write_clouds
@@ -101,26 +102,32 @@ def write_views(
     static = static_cloud(
         sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, confidence=sure, lens=lens
     )
-    if config.output.clouds:
+
+    def clouds() -> None:
         moving = dynamic_clouds(sequence.images, depth, sequence.masks, intrinsics, poses, config.fusion, lens)
         write_clouds(folder, static, _until(should_stop, moving))
-    _check(should_stop)
-    if config.output.pictures:
+
+    def pictures() -> None:
         draw_trajectory(folder.trajectory_picture, poses, sequence.ground_truth.world_T_cam, unit=unit)
+        _check(should_stop)
         draw_depth_strip(folder.depth_picture, sequence.images, sequence.depths, depth, unit=unit)
-
-        def dynamic(frame: int) -> tuple[np.ndarray, ImageArray]:
-            return dynamic_cloud(
-                sequence.images[frame],
-                depth[frame],
-                sequence.masks[frame],
-                intrinsics[frame],
-                poses[frame],
-                config.fusion,
-                lens,
-            )
-
+        _check(should_stop)
         draw_scene(folder.scene_picture, reconstruction, static, dynamic)
+
+    def dynamic(frame: int) -> tuple[np.ndarray, ImageArray]:
+        return dynamic_cloud(
+            sequence.images[frame],
+            depth[frame],
+            sequence.masks[frame],
+            intrinsics[frame],
+            poses[frame],
+            config.fusion,
+            lens,
+        )
+
+    wanted = [*([clouds] if config.output.clouds else []), *([pictures] if config.output.pictures else [])]
+    # Clouds mostly wait for the disk.
+    map_in_order(lambda write: write(), wanted, min(thread_count(), len(wanted)))
 
 
 def _until(should_stop: Callable[[], bool], items: Iterable[ValueT]) -> Iterator[ValueT]:

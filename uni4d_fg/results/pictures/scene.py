@@ -14,12 +14,14 @@ from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, evenly_spread
 from uni4d_fg.optim.threads import map_in_order, thread_count
-from uni4d_fg.results.pictures.figure import INK, MUTED, new_figure, save_figure, spread_frames, upright_axes
+from uni4d_fg.results.pictures.figure import INK, MUTED, Collage, spread_frames, upright_axes
 from uni4d_fg.results.pictures.splatting import View, look_at, render
 from uni4d_fg.slam.reconstruction import Reconstruction
 
 _BACKGROUND = (247, 248, 250)
 _PANEL = (450, 640)
+"""Height and width, px."""
+_GAP_PX, _TITLE_PX = 10, 30
 _ELEVATION_DEG = 22.0
 _MARGIN = 0.04
 _OUTSIDE = 0.15
@@ -58,7 +60,8 @@ def draw_scene(
     trails, trail_colors = _trails(reconstruction)
     columns = 2 if len(frames) > 1 else 1
     rows = -(-len(frames) // columns)
-    figure = new_figure(6.4 * columns, 4.7 * rows)
+    height, width = view.image_size
+    collage = Collage(columns * (width + _GAP_PX) + _GAP_PX, rows * (height + _TITLE_PX) + _GAP_PX)
     clouds = [dynamic(frame) for frame in frames]
 
     def rendered(cloud: tuple[FloatArray, ImageArray]) -> tuple[ImageArray, FloatArray]:
@@ -73,15 +76,12 @@ def draw_scene(
 
     views = map_in_order(rendered, clouds, thread_count())
     for number, (frame, (image, depth)) in enumerate(zip(frames, views, strict=True)):
-        panel = figure.add_subplot(rows, columns, number + 1)
-        panel.imshow(image)
+        row, column = divmod(number, columns)
+        panel = collage.add_picture(image, _GAP_PX + column * (width + _GAP_PX), _TITLE_PX + row * (height + _TITLE_PX))
         _draw_trails(panel, view, depth, trails[:, max(0, frame - trail_frames) : frame + 1], trail_colors)
         _draw_cameras(panel, view, reconstruction, frame)
-        panel.set_xlim(-0.5, view.image_size[1] - 0.5)
-        panel.set_ylim(view.image_size[0] - 0.5, -0.5)
-        panel.set_axis_off()
         panel.set_title(f"frame {frame}", loc="left", fontsize=9, color=MUTED)
-    save_figure(path, figure)
+    collage.save(path)
 
 
 def times_of_the_subject(observed: BoolArray, count: int) -> list[int]:

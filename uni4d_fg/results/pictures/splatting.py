@@ -14,6 +14,9 @@ _MAX_RADIUS_PX = 6
 _RADII_PX = np.array([0.0, 1.0, 1.42, 2.0, 2.24, 3.0, 4.0, 5.0, 6.0])
 """Radii that discs are rounded down to: from each to the next, other pixels are inside."""
 _NEAR_M = 1e-3
+_FAR_M = 1e9
+_MOST_SHADE = np.float32(0.2)
+"""What one neighbor in front adds to the shade at most."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,12 @@ def render(
     fine = view.scaled(2)
     color, depth = _splat(fine, points, colors, point_size_m, smallest_px)
     shade = _edge_shading(depth, edge_strength)
-    image = np.where(np.isfinite(depth)[..., None], color * shade[..., None], np.array(background, dtype=np.float32))
-    image = 0.25 * (image[::2, ::2] + image[::2, 1::2] + image[1::2, ::2] + image[1::2, 1::2])
-    nearest = np.minimum(np.minimum(depth[::2, ::2], depth[::2, 1::2]), np.minimum(depth[1::2, ::2], depth[1::2, 1::2]))
+    color *= shade[..., None]
+    color[~np.isfinite(depth)] = background
+    height, width = view.image_size
+    image = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
+    rows = np.minimum(depth[::2], depth[1::2])
+    nearest = np.minimum(rows[:, ::2], rows[:, 1::2])
     return np.clip(np.rint(image), 0, 255).astype(np.uint8), nearest
 
 
@@ -143,15 +149,15 @@ def _disc(radius: float) -> ImageArray:
 
 def _edge_shading(depth: FloatArray, strength: float) -> Float32Array:
     """Darken pixels that lie behind their neighbors (eye-dome lighting): factors (H, W) in (0, 1]."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_depth = np.log(depth).astype(np.float32)
-    empty = ~np.isfinite(log_depth)
-    log_depth[empty] = np.nan
+    # What is empty counts as far away: beside nothing nothing is darkened.
+    log_depth = np.log(np.minimum(depth, _FAR_M).astype(np.float32))
     total = np.zeros(depth.shape, np.float32)
     for shift in (1, 3):
         for axis in (0, 1):
-            for step in (shift, -shift):
-                behind = log_depth - np.roll(log_depth, step, axis=axis)
-                # Comparisons with NaN are false: beside nothing nothing is darkened.
-                np.add(total, np.fmin(np.fmax(behind, np.float32(0.0)), np.float32(0.2)), out=total)
+            first, second = [slice(None)] * 2, [slice(None)] * 2
+            first[axis], second[axis] = slice(None, -shift), slice(shift, None)
+            before, after = tuple(first), tuple(second)
+            behind = log_depth[after] - log_depth[before]
+            total[after] += np.clip(behind, 0.0, _MOST_SHADE)
+            total[before] += np.clip(-behind, 0.0, _MOST_SHADE)
     return np.asarray(np.exp(-np.float32(strength) * total))

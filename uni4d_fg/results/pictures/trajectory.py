@@ -16,6 +16,9 @@ from uni4d_fg.results.pictures.figure import GRID, INK, MUTED, new_figure, save_
 
 _MIN_EXTENT_M = 0.02
 _VIEW_ARROWS = 16
+_PANELS = ((0.07, 0.09, 0.39, 0.77), (0.53, 0.09, 0.39, 0.77))
+_BAR = (0.935, 0.18, 0.012, 0.59)
+"""Left, bottom, width and height in parts of the figure."""
 
 
 def draw_trajectory(
@@ -50,8 +53,9 @@ def draw_trajectory(
     direction = poses[:, :3, 2] @ axes.T
     reference = None if truth is None else (truth[:, :3, 3] - origin) @ axes.T
 
-    figure = new_figure(11.0, 5.6)
-    figure.suptitle(title, color=INK, fontsize=13, x=0.02, ha="left")
+    # Placed by hand: a layout that is found takes longer than the rest of the picture.
+    figure = new_figure(11.0, 5.6, layout=None)
+    figure.suptitle(title, color=INK, fontsize=13, x=0.02, y=0.97, ha="left")
     everything = estimate if reference is None else np.concatenate((estimate, reference))
     center = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     half = 0.58 * max(float(np.ptp(everything, axis=0).max()), _MIN_EXTENT_M)
@@ -59,7 +63,7 @@ def draw_trajectory(
     panels = (("Top view", 0, 1, right, forward), ("Side view", 1, 2, forward, up))
     lines = None
     for column, (name, i, j, label_x, label_y) in enumerate(panels):
-        panel = figure.add_subplot(1, 2, column + 1)
+        panel = figure.add_axes(_PANELS[column])
         _style(panel, name, label_x, label_y)
         if reference is not None:
             panel.plot(
@@ -71,7 +75,7 @@ def draw_trajectory(
         panel.set_aspect("equal")
         panel.legend(frameon=False, fontsize=9, labelcolor=INK, loc="best")
     if lines is not None:
-        bar = figure.colorbar(lines, ax=figure.axes, shrink=0.75, pad=0.015, aspect=32)
+        bar = figure.colorbar(lines, cax=figure.add_axes(_BAR))
         bar.set_label("frame", color=INK, fontsize=9)
         bar.ax.tick_params(labelsize=8, colors=MUTED)
         bar.ax.yaxis.set_major_locator(MaxNLocator(integer=True))
