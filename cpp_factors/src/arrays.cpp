@@ -195,15 +195,4 @@ int expect_count(std::int64_t count, const char* name) {
   return static_cast<int>(count);
 }
 
-NewArray::NewArray(std::vector<std::size_t> shape) : shape_(std::move(shape)) {
-  std::size_t size = 1;
-  for (const std::size_t length : shape_) size *= length;
-  data_ = new double[size > 0 ? size : 1];
-  owner_ = nb::capsule(data_, [](void* p) noexcept { delete[] static_cast<double*>(p); });
-}
-
-nb::ndarray<nb::numpy, double> NewArray::release() {
-  return nb::ndarray<nb::numpy, double>(data_, shape_.size(), shape_.data(), owner_);
-}
-
 }  // namespace uni4d_fg

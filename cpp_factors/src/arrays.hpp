@@ -91,18 +91,26 @@ int expect_count(std::int64_t count, const char* name);
 
 [[noreturn]] void refuse(const std::string& message);
 
-/// Hand a new C-contiguous float64 array to Python. Take the GIL before.
-class NewArray {
+/// Hand a new C-contiguous array to Python. Take the GIL before.
+template <typename T>
+class NewArrayOf {
  public:
-  explicit NewArray(std::vector<std::size_t> shape);
-  double* data() { return data_; }
-  nb::ndarray<nb::numpy, double> release();
+  explicit NewArrayOf(std::vector<std::size_t> shape) : shape_(std::move(shape)) {
+    std::size_t size = 1;
+    for (const std::size_t length : shape_) size *= length;
+    data_ = new T[size > 0 ? size : 1];
+    owner_ = nb::capsule(data_, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  }
+  T* data() { return data_; }
+  nb::ndarray<nb::numpy, T> release() { return {data_, shape_.size(), shape_.data(), owner_}; }
 
  private:
   std::vector<std::size_t> shape_;
-  double* data_;
+  T* data_;
   nb::capsule owner_;
 };
+
+using NewArray = NewArrayOf<double>;
 
 }  // namespace uni4d_fg
 

@@ -2,8 +2,8 @@
 
 Everything is in the compiled module ``_core``: ``factor_types`` lists the factor types that have a kernel,
 ``residual`` and ``linearize`` run one by its name, ``whiten`` and ``robust_energy`` apply noise and robust kernels,
-the systems solve the stages, ``register_patches`` finds patches in an image, and ``plane_sweep`` matches views. Arrays
-are float64 (row numbers int64) and C-contiguous; a ValueError or TypeError names the argument that is not.
+the systems solve the stages, ``register_patches`` finds patches in an image, ``plane_sweep`` matches views and
+``compare_frames`` their depth. Arrays are float64 (row numbers int64, maps float32) and C-contiguous; a ValueError or TypeError names the argument that is not.
 """
 
 from uni4d_fg_cpp import _core
@@ -12,6 +12,7 @@ from uni4d_fg_cpp._core import (
     LandmarkSystem,
     PairSystem,
     TrajectorySystem,
+    compare_frames,
     factor_types,
     linearize,
     plane_sweep,
@@ -27,6 +28,7 @@ __all__ = [
     "PairSystem",
     "TrajectorySystem",
     "_core",
+    "compare_frames",
     "factor_types",
     "linearize",
     "plane_sweep",

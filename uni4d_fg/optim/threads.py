@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache, wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -88,8 +88,23 @@ def map_in_order(function: Callable[[ItemT], ResultT], items: list[ItemT], threa
 
     BLAS is limited to one thread even when ``threads`` is 1, so that its sums do not depend on that number.
     """
+    with workers_in_order(threads if len(items) > 1 else 1) as mapped:
+        return list(mapped(function, items))
+
+
+class OrderedMap(Protocol):
+    """Applies a function to items on worker threads, all of which start at once; results come in order."""
+
+    def __call__(self, function: Callable[[ItemT], ResultT], items: list[ItemT], /) -> Iterator[ResultT]:
+        """Return the results one by one, in the order of the items."""
+
+
+@contextmanager
+def workers_in_order(threads: int) -> Iterator[OrderedMap]:
+    """Keep worker threads for many calls of what :func:`map_in_order` does; with one thread, the caller's own."""
     with one_blas_thread():
-        if threads == 1 or len(items) < 2:
-            return [function(item) for item in items]
+        if threads == 1:
+            yield map
+            return
         with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(function, items))
+            yield pool.map

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.bleeding import from_nearest
 from uni4d_fg.results.fusion.broken_frames import contradicting_frames
-from uni4d_fg.results.fusion.cue_error import KnownDepth, correct_cue, fit_affine
+from uni4d_fg.results.fusion.cue_error import (
+    KnownDepth,
+    correct_cue,
+    fit_affine,
+    smooth_field,
+    smooth_field_of_points,
+)
 from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.results.fusion.multiview.measured import Measured
 from uni4d_fg.results.fusion.static_depth import fuse_static, held_out_errors, known_depth, without_edges
@@ -46,6 +53,38 @@ def test_affine_and_smooth_errors_are_taken_out(rng: np.random.Generator) -> Non
     before, after = (np.abs(x - np.log(depth)).mean() for x in (np.log(cue), corrected.log_depth))
     assert before > 0.1
     assert after < 0.012
+
+
+@pytest.mark.parametrize("part", [1.0, 0.02])
+def test_windows_on_coarse_grids_are_windows_on_the_map(rng: np.random.Generator, part: float) -> None:
+    shape, config = (240, 320), FusionConfig()
+    coarse = rng.normal(0.0, 0.05, (6, 8)).astype(np.float32)
+    smooth = cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+    weight = (rng.random(shape) < part).astype(np.float32)
+    residual = (smooth + 0.01 * rng.standard_normal(shape)).astype(np.float32)
+    expected = np.zeros(shape, np.float32)
+    for share in config.field_windows:
+        mass = cv2.GaussianBlur(weight, (0, 0), share * shape[1])
+        pull = cv2.GaussianBlur(weight * (residual - expected), (0, 0), share * shape[1])
+        expected += pull / (mass + np.float32(config.field_prior))
+    found = smooth_field(residual, weight, config)
+    assert np.abs(found - expected).mean() < 0.01 * np.abs(expected).mean()
+    assert np.abs(found - smooth).mean() < 1.01 * np.abs(expected - smooth).mean()
+    at = np.nonzero(weight)
+    of_points = smooth_field_of_points(at, residual[at].astype(np.float64), 1.0, shape, config)
+    np.testing.assert_allclose(of_points, found, atol=1e-5)
+
+
+def test_points_may_share_a_pixel_and_be_on_a_large_image(rng: np.random.Generator) -> None:
+    config, shape = FusionConfig(), (480, 640)
+    at = tuple(rng.integers(0, side, 500) for side in shape)
+    twice = tuple(np.concatenate([where, where]) for where in at)
+    residual = rng.normal(0.1, 0.02, 500)
+    once = smooth_field_of_points(at, residual, 1.0, shape, config)
+    np.testing.assert_allclose(
+        smooth_field_of_points(twice, np.concatenate([residual] * 2), 0.5, shape, config), once, atol=1e-6
+    )
+    assert once.shape == shape
 
 
 def test_a_frame_without_anything_known_keeps_its_scale() -> None:
@@ -94,7 +133,7 @@ def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(
     noisy = (cue * np.exp(0.03 * rng.standard_normal(depth.shape))).astype(np.float32)
     for error, better in ((0.005, True), (0.1, False)):
         seen = np.exp(truth + error * rng.standard_normal(truth.shape)).astype(np.float32)
-        measured = Measured(seen, np.full(depth.shape, 0.95, np.float32), sigma)
+        measured = Measured(np.log(seen), np.full(depth.shape, 0.95, np.float32), sigma)
         judged = held_out_errors(noisy, measured, uv, log_z, static, 0.0, FusionConfig())
         assert (judged.matching < 0.8) is better, judged
         assert judged.telling
@@ -115,7 +154,7 @@ def test_matched_depth_that_is_sure_wins_over_a_cue_that_is_wrong_and_says_so(rn
     sure = np.full(depth.shape, 0.97, np.float32)
     sure[:, :10] = 0.1
     seen = np.where(sure > 0.5, truth + 0.004 * rng.standard_normal(truth.shape), truth + 0.5).astype(np.float32)
-    measured = Measured(np.exp(seen), sure, np.full(depth.shape, 0.004, np.float32))
+    measured = Measured(seen, sure, np.full(depth.shape, 0.004, np.float32))
     bled = cue.copy()
     bled[20:30, 30:50] *= 1.4
     places = np.argwhere(rng.random(depth.shape) < 0.1)
@@ -135,7 +174,9 @@ def test_matched_depth_leaves_the_edges_to_a_cue_that_has_them(rng: np.random.Ge
     depth = np.where(np.arange(WIDTH) < 40, 2.0, 3.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
     cue = (depth * np.exp(0.01 * rng.standard_normal(depth.shape))).astype(np.float32)
     blurred = cv2.GaussianBlur(depth, (0, 0), 2.0)
-    measured = Measured(blurred, np.full(depth.shape, 0.97, np.float32), np.full(depth.shape, 0.003, np.float32))
+    measured = Measured(
+        np.log(blurred), np.full(depth.shape, 0.97, np.float32), np.full(depth.shape, 0.003, np.float32)
+    )
     said = without_edges(measured, cue)
     assert (said.confidence[:, 36:44] == 0).all()
     np.testing.assert_array_equal(said.confidence[:, :30], measured.confidence[:, :30])
@@ -160,7 +201,7 @@ def test_what_a_cue_mixes_is_taken_from_matching_or_the_nearest_sure_surface(rng
     sure = np.full(depth.shape, 0.97, np.float32)
     sure[:, 41:44] = 0.2
     seen = np.where(sure > 0.5, depth, np.float32(5.0)).astype(np.float32)
-    measured = Measured(seen, sure, np.full(depth.shape, 0.004, np.float32))
+    measured = Measured(np.log(seen), sure, np.full(depth.shape, 0.004, np.float32))
     places = np.argwhere((rng.random(depth.shape) < 0.2) & (np.abs(np.arange(WIDTH) - 40) > 8))
     uv, log_z = places[:, ::-1].astype(np.float64), np.log(depth[places[:, 0], places[:, 1]]).astype(np.float64)
     known = known_depth(measured, uv, log_z, ~NOWHERE, (HEIGHT, WIDTH))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, FloatArray, evenly_spread
+from uni4d_fg.arrays import Float32Array, FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 
 _MAX_SAMPLES = 4000
@@ -26,6 +26,8 @@ _SHIFT_SIGMA = 0.08
 """Standard deviation of the shift, of the median inverse depth, before anything is seen."""
 _INDEPENDENT = 30
 """The smooth error makes samples alike: all of a frame say no more than this many on their own."""
+_WINDOW_NODES = 4
+"""Nodes of a grid per standard deviation of the window that is taken on it, at least."""
 _FARTHEST = 0.02
 """Least inverse depth, of the median one."""
 
@@ -52,8 +54,14 @@ class CorrectedCue:
     """a"""
     shift: float
     """b, 1/m."""
+    least_inverse: float
+    """1/m: what is farther is bounded."""
     field: Float32Array
     """(h, w) f, with the opposite sign."""
+
+    def affine(self, cue: Float32Array) -> Float32Array:
+        """Return the log depth of a cue, m, without its affine error alone; of any pixels of the same frame."""
+        return _affine_log_depth(cue, self.scale, self.shift, self.least_inverse)
 
 
 def fit_affine(
@@ -110,7 +118,8 @@ def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, 
     rows, columns = np.nonzero(usable)
     if len(rows) < _MIN_SAMPLES:
         nothing, scale = np.zeros_like(cue), float(np.exp(-default_log_scale))
-        return CorrectedCue(np.log(cue) + np.float32(default_log_scale), np.nan, scale, 0.0, nothing)
+        log_depth = np.log(cue) + np.float32(default_log_scale)
+        return CorrectedCue(log_depth, np.nan, scale, 0.0, _least_inverse(cue, scale, 0.0), nothing)
     some = evenly_spread(len(rows), _MAX_SAMPLES)
     at = rows[some], columns[some]
     a, b, spread = fit_affine(
@@ -119,20 +128,26 @@ def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, 
         known.weight[at].astype(np.float64),
         _SHIFT_SIGMA,
     )
-    log_depth = affine_log_depth(cue, a, b)
+    least = _least_inverse(cue, a, b)
+    log_depth = _affine_log_depth(cue, a, b, least)
     residual = np.where(usable, known.log_depth - log_depth, np.float32(0))
     weight = np.where(usable & (np.abs(residual) < 4.0 * spread + 0.02), known.weight, np.float32(0))
     field = smooth_field(residual, weight, config)
-    return CorrectedCue(log_depth + field, spread, a, b, field)
+    return CorrectedCue(log_depth + field, spread, a, b, least, field)
 
 
-def affine_log_depth(cue: Float32Array, scale: float, shift: float) -> Float32Array:
-    """Return ``-log(scale / cue + shift)`` (h, w); what would be beyond all bounds is bounded by a far depth."""
-    inverse = np.float32(scale) / cue + np.float32(shift)
-    if not np.isfinite(inverse).any():
-        return np.full_like(inverse, np.nan)
-    farthest = np.float32(_FARTHEST * np.nanmedian(inverse))
-    return np.asarray(-np.log(np.maximum(inverse, farthest)), dtype=np.float32)
+def _affine_log_depth(cue: Float32Array, scale: float, shift: float, least_inverse: float) -> Float32Array:
+    inverse = np.maximum(np.float32(scale) / cue + np.float32(shift), np.float32(least_inverse))
+    return np.asarray(-np.log(inverse), dtype=np.float32)
+
+
+def _least_inverse(cue: Float32Array, scale: float, shift: float) -> float:
+    """Return the inverse depth below which an affinely corrected cue is taken to be beyond all bounds, 1/m."""
+    known = np.flatnonzero(np.isfinite(cue))
+    if not known.size:
+        return 0.0
+    some = cue.ravel()[known[evenly_spread(known.size, _MAX_SAMPLES)]]
+    return _FARTHEST * float(np.median(np.float32(scale) / some + np.float32(shift)))
 
 
 def smooth_field(residual: Float32Array, weight: Float32Array, config: FusionConfig) -> Float32Array:
@@ -143,16 +158,75 @@ def smooth_field(residual: Float32Array, weight: Float32Array, config: FusionCon
         weight: (h, w) not negative.
         config: Windows, and the strength of the wider window where little is known.
     """
-    field = np.zeros_like(residual)
-    for share in config.field_windows:
-        sigma_px = share * residual.shape[1]
-        mass = cv2.GaussianBlur(weight, (0, 0), sigma_px)
-        pull = cv2.GaussianBlur(weight * (residual - field), (0, 0), sigma_px)
-        field = field + pull / (mass + np.float32(config.field_prior))
-    return field
+    size = _nodes(min(config.field_windows), residual.shape)
+    mass, pull = (_averaged(values, size) for values in (weight, weight * residual))
+    return _field(mass, pull, residual.shape, config)
+
+
+def smooth_field_of_points(
+    at: tuple[IntArray, IntArray], residual: FloatArray, weight: float, shape: tuple[int, int], config: FusionConfig
+) -> Float32Array:
+    """Return what :func:`smooth_field` does, (h, w), where all but some points have no weight.
+
+    Args:
+        at: Row and column (N,) of each point; several may share a pixel.
+        residual: (N,) of log depth.
+        weight: Of each point.
+        shape: (h, w).
+        config: As there.
+    """
+    rows, columns = _nodes(min(config.field_windows), shape)
+    node = (at[0] * rows // shape[0]) * columns + at[1] * columns // shape[1]
+    share = weight * (rows * columns) / (shape[0] * shape[1])
+    mass, pull = (
+        (share * np.bincount(node, values, minlength=rows * columns)).reshape(rows, columns).astype(np.float32)
+        for values in (None, residual)
+    )
+    return _field(mass, pull, shape, config)
+
+
+def _nodes(share: float, shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the size of a grid over a map (h, w) that is fine beside a window of this part of the width."""
+    step = max(1, int(share * shape[1] / _WINDOW_NODES))
+    return max(1, round(shape[0] / step)), max(1, round(shape[1] / step))
+
+
+def _field(mass: Float32Array, pull: Float32Array, shape: tuple[int, ...], config: FusionConfig) -> Float32Array:
+    """Return the field (h, w) from weights and weighted residuals on the finest grid.
+
+    Each window is taken on a grid that is coarse beside it, as the mean over a window is smooth.
+    """
+    grids = []
+    for share in sorted(config.field_windows):
+        mass, pull = (_averaged(values, _nodes(share, shape)) for values in (mass, pull))
+        grids.append((share * mass.shape[1], mass, pull))
+    field = np.zeros((1, 1), np.float32)
+    for sigma, mass, pull in reversed(grids):
+        field = _resized(field, mass.shape)
+        # Blocks and interpolation between nodes widen a window by themselves.
+        narrower = sigma if mass.shape == shape else float(np.sqrt(max(sigma**2 - 0.25, 0.1)))
+        around = cv2.GaussianBlur(np.dstack((mass, pull - mass * field)), (0, 0), narrower)
+        field = field + around[..., 1] / (around[..., 0] + np.float32(config.field_prior))
+    return _resized(field, shape)
+
+
+def _averaged(values: Float32Array, shape: tuple[int, int]) -> Float32Array:
+    if values.shape == shape:
+        return values
+    return np.asarray(cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _resized(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:
+    if values.shape == shape:
+        return values
+    resized = cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(resized, dtype=np.float32)
 
 
 def _weighted_median(values: FloatArray, weight: FloatArray) -> float:
+    if weight.min() == weight.max() > 0:
+        middle = (len(values) - 1) // 2
+        return float(np.partition(values, middle)[middle])
     order = np.argsort(values)
     mass = np.cumsum(weight[order])
     return float(values[order[min(int(np.searchsorted(mass, 0.5 * mass[-1])), len(values) - 1)]])

@@ -14,7 +14,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray, warp_back
 from uni4d_fg.results.fusion.carried import filled_smoothly
-from uni4d_fg.results.fusion.cue_error import smooth_field
+from uni4d_fg.results.fusion.cue_error import smooth_field_of_points
 
 _POINT_WEIGHT = 0.5
 """Of a trajectory's point, where a window full of sure pixels has one per pixel."""
@@ -22,6 +22,8 @@ _WRONG = 0.25
 """A point whose log depth departs farther from the instance's usual departure is wrong."""
 _WHOLE = 0.99
 """Part of the pixels between which depth is carried that have to be the instance's."""
+_WINDOW_SIGMAS = 4.0
+"""Half a Gaussian window, of its standard deviation."""
 _BLED = 0.03
 """Change of log depth towards the border of a mask from which on it may come from what lies behind."""
 
@@ -47,18 +49,24 @@ def correct_moving(
     """
     height, width = log_depth.shape
     column, row = np.clip(np.rint(uv), 0, (width - 1, height - 1)).astype(np.int64).T
+    on_it = np.flatnonzero(pixels[row, column])
+    row, column, log_z = row[on_it], column[on_it], log_z[on_it]
     left = log_z - log_depth[row, column]
-    inside = cv2.distanceTransform(np.pad(pixels.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    good = np.isfinite(left) & pixels[row, column] & (inside[row, column] > radius_px)
+    good = np.isfinite(left)
+    if radius_px > 0:
+        good &= _inside(pixels)[row, column] > radius_px
     if np.count_nonzero(good) < config.min_control_points:
         return log_depth
     usual = float(np.median(left[good]))
     good &= np.abs(left - usual) < _WRONG
-    weight, residual = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-    weight[row[good], column[good]] = _POINT_WEIGHT
-    residual[row[good], column[good]] = left[good] - usual
-    field = usual + smooth_field(residual, weight, config)
-    return np.where(pixels, log_depth + field, log_depth).astype(np.float32)
+    at = row[good], column[good]
+    field = smooth_field_of_points(at, left[good] - usual, _POINT_WEIGHT, (height, width), config)
+    return np.where(pixels, log_depth + (np.float32(usual) + field), log_depth)
+
+
+def _inside(pixels: BoolArray) -> Float32Array:
+    """Return how far each pixel of an instance is from its border, px, (H, W)."""
+    return np.asarray(cv2.distanceTransform(np.pad(pixels.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1])
 
 
 def without_bleeding(log_depth: Float32Array, pixels: BoolArray, radius_px: float) -> Float32Array:
@@ -71,16 +79,29 @@ def without_bleeding(log_depth: Float32Array, pixels: BoolArray, radius_px: floa
     """
     if radius_px <= 0 or not pixels.any():
         return log_depth
-    inside = cv2.distanceTransform(np.pad(pixels.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    sigma = 0.7 * radius_px
+    box = _box_around(pixels, int(np.ceil(_WINDOW_SIGMAS * sigma)))
+    here, pixels = log_depth[box], pixels[box]
+    inside = _inside(pixels)
     deepest = float(inside.max())
     share = np.clip(inside / np.float32(min(radius_px, 0.7 * deepest)), 0, 1)
-    known = pixels & np.isfinite(log_depth)
+    known = pixels & np.isfinite(here)
     weight = np.where(known, share**6 + np.float32(1e-6), np.float32(0))
-    values = np.where(known, log_depth, np.float32(0))
-    sigma = 0.7 * radius_px
-    mean = cv2.GaussianBlur(weight * values, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-12)
+    values = np.where(known, here, np.float32(0))
+    window = (2 * int(np.ceil(_WINDOW_SIGMAS * sigma)) + 1,) * 2
+    around = cv2.GaussianBlur(np.dstack((weight * values, weight)), window, sigma)
+    mean = around[..., 0] / np.maximum(around[..., 1], 1e-12)
     bled = known & (share < 1) & (values - mean > _BLED * (1 - share))
-    return np.where(bled, mean, log_depth).astype(np.float32)
+    out = log_depth.copy()
+    out[box] = np.where(bled, mean, here)
+    return out
+
+
+def _box_around(pixels: BoolArray, margin: int) -> tuple[slice, slice]:
+    """Return the rows and columns of an instance, with a margin where the image has one."""
+    ends = (np.flatnonzero(pixels.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(max(0, at[0] - margin), at[-1] + margin + 1) for at in ends)
+    return rows, columns
 
 
 def carried_moving(

@@ -67,8 +67,8 @@ class StaticDepth:
 
     log_depth: Float32Array
     """NaN where nothing is known."""
-    sigma: Float32Array
-    """Standard deviation of its error where it is right."""
+    sigma: float
+    """Standard deviation of its error where it is right: the median one."""
     confidence: Float32Array
     """Probability that it is right to 3 %, as far as one frame knows."""
     corrected: CorrectedCue
@@ -112,7 +112,7 @@ def known_depth(
     weight = np.zeros(shape, np.float32)
     shared, reliability = 0.0, 0.0
     if measured is not None:
-        log_depth = np.log(measured.depth)
+        log_depth = measured.log_depth.copy()
         weight = np.where(static, np.maximum(measured.confidence - 0.5, 0) * 2, np.float32(0)).astype(np.float32)
         sure = (measured.confidence[at] > _SURE) & ~_beside_edges(measured)[at]
         shared = _UNCHECKED_SIGMA
@@ -162,17 +162,17 @@ def fuse_static(
     if measured is None or known.reliability == 0.0:
         # The cue errs less where landmarks have corrected it, but frames are compared everywhere.
         usual = corrected.spread if np.isfinite(corrected.spread) else _UNCOMPARED_SIGMA
-        sigma = np.full(shape, max(usual, _LANDMARK_SIGMA), np.float32)
-        error = np.full(shape, _MEAN_TO_SIGMA * cue_error if np.isfinite(cue_error) else usual, np.float32)
-        sure = _within(error) * np.isfinite(corrected.log_depth)
-        return StaticDepth(corrected.log_depth, sigma, sure.astype(np.float32), corrected, np.zeros_like(sigma))
+        error = _MEAN_TO_SIGMA * cue_error if np.isfinite(cue_error) else usual
+        sure = np.where(np.isfinite(corrected.log_depth), _within(np.float32(error)), np.float32(0))
+        nothing = np.zeros_like(corrected.log_depth)
+        return StaticDepth(corrected.log_depth, max(usual, _LANDMARK_SIGMA), sure, corrected, nothing)
     cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
     has_cue = np.isfinite(corrected.log_depth)
     mixed = np.zeros(shape, dtype=bool)
     if bleeding_px > 0:
         mixed = across_edges(corrected.log_depth, bleeding_px) & ~like_moving
         cue_right = np.where(mixed, np.minimum(cue_right, _MIXED_RIGHT), cue_right)
-    seen = np.log(measured.depth)
+    seen = measured.log_depth
     p = np.clip(known.reliability * measured.confidence, 1e-3, 1 - 1e-3)
     difference = np.where(has_cue, seen - np.where(has_cue, corrected.log_depth, 0), 0)
     matched = np.hypot(measured.sigma, np.float32(known.shared_sigma))
@@ -194,12 +194,16 @@ def fuse_static(
     share[filled] = _FILLED_RIGHT
     sure = share * _within(sigma)
     return StaticDepth(
-        log_depth.astype(np.float32), sigma.astype(np.float32), sure.astype(np.float32), corrected, measured.confidence
-    )  # fmt: skip
+        log_depth.astype(np.float32),
+        float(np.nanmedian(sigma)),
+        sure.astype(np.float32),
+        corrected,
+        measured.confidence,
+    )
 
 
-def _within(sigma: Float32Array) -> Float32Array:
-    """Return the probability (h, w) that log depth of this standard deviation is right to 3 %."""
+def _within(sigma: Float32Array | np.float32) -> Float32Array:
+    """Return the probability that log depth of this standard deviation is right to 3 %, of the same shape."""
     return np.asarray(erf(_RIGHT / (np.sqrt(2.0) * np.maximum(sigma, 1e-6))), dtype=np.float32)
 
 
@@ -254,7 +258,7 @@ def held_out_errors(
     beside = cv2.dilate(_beside_edges(measured).astype(np.uint8), np.ones((2 * _TRACKED_PX + 1,) * 2, np.uint8)) > 0
     sure = compared & ~beside & (measured.confidence > _SURE)
     error = mean_error(corrected, sure)
-    ratio = mean_error(np.log(measured.depth), sure) / max(error, _LEAST_ERROR)
+    ratio = mean_error(measured.log_depth, sure) / max(error, _LEAST_ERROR)
     return HeldOut(of_cue, ratio, not error < _OWN_SOURCE)
 
 
@@ -267,7 +271,7 @@ def without_edges(measured: Measured, cue: Float32Array) -> Measured:
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log_cue = np.log(cue)
-    log_cue = np.where(np.isfinite(log_cue), log_cue, np.log(measured.depth))
+    log_cue = np.where(np.isfinite(log_cue), log_cue, measured.log_depth)
     beside = (_beside_edges(measured) | _changes(log_cue)).astype(np.uint8)
     said = np.where(cv2.dilate(beside, _BLUR_WINDOW) > 0, np.float32(0), measured.confidence)
     return replace(measured, confidence=said)
@@ -275,7 +279,7 @@ def without_edges(measured: Measured, cue: Float32Array) -> Measured:
 
 def _beside_edges(measured: Measured) -> BoolArray:
     """Return where matching, which blurs edges by its window, may have mixed two surfaces, (h, w)."""
-    return _changes(np.log(measured.depth))
+    return _changes(measured.log_depth)
 
 
 def _changes(log_depth: Float32Array) -> BoolArray:

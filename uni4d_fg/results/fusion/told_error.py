@@ -34,7 +34,7 @@ def final_confidence(alone: Float32Array, averaged: Averaged) -> Float32Array:
         alone: (h, w) the same, as the frame alone says.
         averaged: Depth, and what the other frames say of it.
     """
-    log_depth = np.log(averaged.depth)
+    log_depth = averaged.log_depth
     missing = ~np.isfinite(log_depth)
     steep = np.where(missing, 0, np.clip(log_range(log_depth, _EDGE_WINDOW), 0, _STEEPEST))
     bounded = np.clip(alone, 1e-3, 1 - 1e-3)

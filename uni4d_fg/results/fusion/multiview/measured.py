@@ -22,8 +22,8 @@ from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, Workin
 class Measured:
     """Static depth of one frame at working size, (h, w) each."""
 
-    depth: Float32Array
-    """m; means nothing where something moves."""
+    log_depth: Float32Array
+    """Means nothing where something moves."""
     confidence: Float32Array
     """Probability that it is right to 3 %; 0 where there is none."""
     sigma: Float32Array
@@ -32,13 +32,13 @@ class Measured:
 
 @dataclass
 class _Raw:
-    depth: Float32Array
+    inverse_depth: Float32Array
     evidence: Evidence
 
 
 @dataclass
 class MultiviewDepth:
-    """Depth of frames by matching, kept as long as frames near them need it; frames are asked for in order."""
+    """Depth of frames by matching, kept until it is told that they are not needed any more."""
 
     frames: Callable[[int], WorkingFrame]
     size: WorkingSize
@@ -55,25 +55,27 @@ class MultiviewDepth:
 
     def at(self, frame: int) -> Measured | None:
         """Return the depth of a frame; None where the camera shows no parallax."""
-        offsets = self.config.compared_offsets
-        oldest = frame - max(offsets, default=0)
-        self.raw = {number: kept for number, kept in self.raw.items() if number >= oldest}
-        self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest - self.config.reach}
         own = self._raw(frame)
         if own is None:
             return None
-        near = [frame + sign * offset for offset in offsets for sign in (-1, 1)]
+        near = [frame + sign * offset for offset in self.config.compared_offsets for sign in (-1, 1)]
         others = [
-            (other.depth, self.world_T_cam[number], self.size.intrinsics(self.intrinsics))
+            (other.inverse_depth, self.world_T_cam[number], self.size.intrinsics(self.intrinsics))
             for number in near
             if 0 <= number < len(self.world_T_cam) and (other := self._raw(number)) is not None
         ]
         averaged = average_over_frames(
-            own.depth, self.world_T_cam[frame], others, self.size.intrinsics(self.intrinsics),
-            self.config.max_disagreement,
+            own.inverse_depth, self.world_T_cam[frame], others, self.size.intrinsics(self.intrinsics),
+            self.config.max_disagreement, self.threads,
         )  # fmt: skip
         evidence = own.evidence.with_neighbors(averaged.agreeing, averaged.seeing)
-        return Measured(averaged.depth, confidence(evidence), relative_sigma(evidence))
+        return Measured(averaged.log_depth, confidence(evidence), relative_sigma(evidence))
+
+    def forget_before(self, frame: int) -> None:
+        """Forget what frames from this one on do not need."""
+        oldest = frame - max(self.config.compared_offsets, default=0)
+        self.raw = {number: kept for number, kept in self.raw.items() if number >= oldest}
+        self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest - self.config.reach}
 
     def _raw(self, frame: int) -> _Raw | None:
         if frame not in self.raw:
@@ -100,6 +102,5 @@ class MultiviewDepth:
             image, [self._shown(view).matched for view in views], other_T_cam, intrinsics, planes, self.config,
             self.threads,
         )  # fmt: skip
-        depth = (1.0 / swept.inverse_depth).astype(np.float32)
-        step = float(planes[1] - planes[0])
-        return _Raw(depth, Evidence.of(swept, step * depth, len(views)))
+        step = np.float32(planes[1] - planes[0])
+        return _Raw(swept.inverse_depth, Evidence.of(swept, step / swept.inverse_depth, len(views)))

@@ -11,6 +11,7 @@ from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.results.fusion.multiview.sweep_numpy import sweep_numpy
+from uni4d_fg.results.fusion.pixel_transfer import pixel_transfer
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,8 @@ def sweep(
         config: Window, penalties and noise.
         threads: Of the C++ version; 0 takes all cores.
     """
-    fx, fy, cx, cy = intrinsics
-    camera = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    turns = np.stack([camera @ pose[:3, :3] @ np.linalg.inv(camera) for pose in other_T_cam])
-    shifts = np.stack([camera @ pose[:3, 3] for pose in other_T_cam])
+    where = [pixel_transfer(intrinsics, intrinsics, pose) for pose in other_T_cam]
+    turns, shifts = (np.stack(parts) for parts in zip(*where, strict=True))
     core, _ = find_extension()
     settings: dict[str, Any] = {
         "radius": config.window_radius_px,

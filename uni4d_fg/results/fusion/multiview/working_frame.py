@@ -92,7 +92,12 @@ def working_frame(image: ImageArray, mask: Int32Array, size: WorkingSize, band_p
         band_px: Width of the band, working px.
     """
     gray = size.shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float32)) / np.float32(255.0)
-    moving = size.marked(mask)
-    if band_px > 0 and moving.any():
-        moving = cv2.dilate(moving.astype(np.uint8), np.ones((2 * band_px + 1,) * 2, np.uint8)) > 0
-    return WorkingFrame(gray, np.where(moving, np.float32(np.nan), gray))
+    static = without_band(~size.marked(mask), band_px)
+    return WorkingFrame(gray, np.where(static, gray, np.float32(np.nan)))
+
+
+def without_band(unmasked: BoolArray, band_px: int) -> BoolArray:
+    """Return the pixels (h, w) outside of masks and of a band of this width around them, px."""
+    if band_px <= 0 or unmasked.all():
+        return unmasked
+    return np.asarray(cv2.erode(unmasked.astype(np.uint8), np.ones((2 * band_px + 1,) * 2, np.uint8)) > 0)

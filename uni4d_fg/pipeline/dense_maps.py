@@ -1,0 +1,360 @@
+"""Dense depth of single frames, from the cue, the landmarks, the trajectories and the frames near them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, evenly_spread
+from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.optim.threads import OrderedMap
+from uni4d_fg.pipeline.steps import Arrays
+from uni4d_fg.results.fusion.averaging import average_over_frames
+from uni4d_fg.results.fusion.bleeding import bleeding_radius
+from uni4d_fg.results.fusion.carried import carried_depth
+from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
+from uni4d_fg.results.fusion.lifting import lifted
+from uni4d_fg.results.fusion.mask_band import looks_moving
+from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
+from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
+from uni4d_fg.results.fusion.multiview.working_frame import (
+    WorkingFrame,
+    WorkingSize,
+    without_band,
+    working_frame,
+)
+from uni4d_fg.results.fusion.static_depth import (
+    HeldOut,
+    StaticDepth,
+    fuse_static,
+    held_out_errors,
+    known_depth,
+    without_edges,
+)
+from uni4d_fg.results.fusion.told_error import final_confidence
+from uni4d_fg.results.fusion.upsampling import upsample_guided
+
+_CARRIED_REACH, _CARRIED_FROM = 6, 2
+"""A frame without a cue takes the depth of this many frames at most this far away."""
+_BESIDE = tuple(range(1, _CARRIED_REACH + 1))
+_AVERAGED_SIGMA = (0.005, 0.06)
+"""Bounds of the standard deviation from which it is told which frames agree."""
+_SHARP_PX = 4.0
+"""Matching blurs edges by this itself: a cue that is found to bleed no farther has the detail of edges, working px."""
+_BETTER = 1.0
+"""Matched depth is used if its error at landmarks is below this part of the corrected cue's ..."""
+_NOT_WORSE = 1.5
+"""... and below this one if the cue bleeds: landmarks do not lie on edges."""
+_FAR_WORSE = 4.0
+"""Above this in one frame, other frames are not tried."""
+_TRIED_FRAMES = 3
+"""Frames that are matched first: where landmarks prefer the cue in all of them, no others are matched."""
+_SURE = 0.8
+"""Matched depth of this confidence tells how far the cue bleeds."""
+_STILL = 0.6
+"""Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
+_BLED_SHARE = 2.0
+"""Moving things take their depth from this many times as far inside as the cue bleeds in the mean."""
+
+
+class FinalStatic(NamedTuple):
+    """Static depth of one frame after averaging, at working size."""
+
+    log_depth: Float32Array
+    """(h, w), NaN where missing."""
+    confidence: Float32Array
+    """(h, w) probability that it is right to 3 %; 0 where something moves."""
+    still: BoolArray
+    """(h, w) outside of masks."""
+
+
+class _Made(NamedTuple):
+    """Static depth of one frame and what the frames near it need of it, at working size, (h, w) each."""
+
+    depth: StaticDepth
+    inverse: Float32Array
+    """Of the depth, 1/m."""
+    log_cue: Float32Array
+    """Before anything was done to it."""
+    unmasked: BoolArray
+
+
+class _Judged(NamedTuple):
+    """What one frame's cue and landmarks say, at working size."""
+
+    cue: Float32Array
+    """(h, w) m, NaN where missing."""
+    uv: FloatArray
+    """(N, 2) landmarks, px ..."""
+    log_z: FloatArray
+    """... and their log depth."""
+    unmasked: BoolArray
+    """(h, w)"""
+    static: BoolArray
+    """(h, w) the same without a band around masks."""
+    errors: HeldOut
+
+
+@dataclass
+class DenseMaps:
+    """Dense depth of single frames, kept as long as frames near them need it; frames are asked for in order."""
+
+    sequence: Sequence
+    control: list[ControlPoints]
+    scene: Arrays
+    config: FusionConfig
+    intrinsics: FloatArray
+    """(T, 4) px."""
+    broken: frozenset[int]
+    """Frames whose cue is not used."""
+    unmatched: str
+    """Why there is no depth from several views."""
+    threads: int
+    size: WorkingSize = field(init=False)
+    multiview: MultiviewDepth = field(init=False)
+    bleeding_px: float = 0.0
+    """How far the cue bleeds across edges, working px."""
+    matched: set[int] = field(default_factory=set)
+    """Frames with depth from several views."""
+    made: dict[int, _Made] = field(default_factory=dict)
+    measured: dict[int, Measured | None] = field(default_factory=dict)
+    """Depth from several views of frames whose static depth is not made yet."""
+
+    def __post_init__(self) -> None:
+        multiview = self.config.multiview
+        self.size = WorkingSize.of(self.sequence.image_size, multiview.longer_side_px)
+        poses: FloatArray = self.scene["world_T_cam"]
+        self.multiview = MultiviewDepth(
+            self._working_frame, self.size, self.intrinsics[0], poses, self._landmarks, multiview, self.threads
+        )
+
+    def try_matching(self) -> None:
+        """Match a few frames to see how far the cue bleeds, and whether landmarks prefer matched depth in any of them.
+
+        A cue that was made from landmarks is not judged by them: matching counts if it bleeds.
+        """
+        if self.unmatched:
+            return
+        sound = [frame for frame in range(self.sequence.num_frames) if frame not in self.broken]
+        tried, bled, untold = list[float](), list[float](), False
+        middle_first = sorted(
+            evenly_spread(len(sound), _TRIED_FRAMES).tolist(), key=lambda at: abs(2 * at - len(sound))
+        )
+        for at in dict.fromkeys(middle_first):
+            measured = self.multiview.at(sound[at])
+            judged = self._judged(sound[at], measured)
+            tried.append(judged.errors.matching)
+            untold |= not judged.errors.telling
+            if not (self.broken or untold) and judged.errors.matching > _FAR_WORSE:
+                break
+            if measured is not None and self._counts(judged.errors, _NOT_WORSE, bleeds=True):
+                radius = self._bleeding(sound[at], judged, measured)
+                bled += [radius] if np.isfinite(radius) else []
+        radius = float(np.median(bled)) if bled else 0.0
+        self.bleeding_px = radius if radius > _SHARP_PX else 0.0
+        limit = self._limit()
+        if not (any(error < limit for error in tried) or self.broken or (untold and self.bleeding_px > 0)):
+            self.unmatched = "adds nothing to this cue, as landmarks say"
+
+    def prepare(self, frames: list[int], mapped: OrderedMap) -> None:
+        """Make what :meth:`final` needs for frames that follow each other, and forget what only those before needed.
+
+        Args:
+            frames: The frames.
+            mapped: The threads that may work on it.
+        """
+        if self.config.static == "nearest_points":
+            return
+        reach = max(self.config.averaged_offsets, default=0)
+        self.made = {number: made for number, made in self.made.items() if number >= frames[0] - reach}
+        near = {
+            frame + sign * offset
+            for frame in frames
+            for offset in (0, *self.config.averaged_offsets, *(_BESIDE if frame in self.broken else ()))
+            for sign in (-1, 1)
+        }
+        wanted = sorted(number for number in near if 0 <= number < self.sequence.num_frames and number not in self.made)
+        if not self.unmatched and wanted:
+            # Frames that are matched share what they are matched with, and matching has threads of its own.
+            self.multiview.forget_before(wanted[0])
+            self.measured |= {number: self.multiview.at(number) for number in wanted}
+        # A broken frame takes its cue from others.
+        for numbers in ([n for n in wanted if n not in self.broken], [n for n in wanted if n in self.broken]):
+            list(mapped(self._static, numbers))
+
+    def final(self, frame: int) -> tuple[Float32Array, FinalStatic | None]:
+        """Return the depth (H, W) of a frame, m, and what is known of static depth where that is made as a field.
+
+        Frames that are prepared may be asked for on several threads.
+        """
+        mask, given = self.sequence.masks[frame], self._given(frame)
+        if self.config.static == "nearest_points":
+            return self._by_nearest_points(frame, given, mask), None
+        mine = self._static(frame)
+        poses: FloatArray = self.scene["world_T_cam"]
+        near = [frame + sign * offset for offset in self.config.averaged_offsets for sign in (-1, 1)]
+        averaged = average_over_frames(
+            mine.inverse,
+            poses[frame],
+            ((self._static(n).inverse, poses[n], self._camera(n)) for n in near if 0 <= n < len(poses)),
+            self._camera(frame),
+            self.config.averaged_sigmas * float(np.clip(mine.depth.sigma, *_AVERAGED_SIGMA)),
+        )
+        sure = final_confidence(mine.depth.confidence, averaged)
+        sure[~mine.unmasked & (mine.depth.matched <= _STILL)] = 0
+        if frame in self.broken or self.bleeding_px:
+            full = np.exp(upsample_guided(averaged.log_depth, self.sequence.images[frame]))
+            full[np.isnan(given)] = np.nan
+        else:
+            full = lifted(averaged.log_depth, mine.log_cue, given, self.size)
+        moving = mask > 0
+        if moving.any():
+            # Masks reach beyond what moves: what other frames see there just the same stands still.
+            if frame in self.matched:
+                moving &= self.size.enlarge(mine.depth.matched) <= _STILL
+            full[moving] = np.exp(self._moving(frame, given)[moving])
+        return full, FinalStatic(averaged.log_depth, sure, mine.unmasked)
+
+    def landmarks_in(self, frame: int) -> tuple[FloatArray, FloatArray]:
+        """Return where a frame sees landmarks, (N, 2) working px, and their log depth (N,)."""
+        uv, log_scale, log_cue = self._landmark_cues(frame)
+        return uv, log_scale + log_cue
+
+    def _given(self, frame: int) -> Float32Array:
+        """Return the cue (H, W), m, NaN where it is not a depth."""
+        cue = self.sequence.depths[frame]
+        with np.errstate(invalid="ignore"):
+            return np.where((cue > 0.0) & (cue < np.inf), cue, np.float32(np.nan))
+
+    def _moving(self, frame: int, given: Float32Array) -> Float32Array:
+        """Return the log depth (H, W) of what moves; means nothing elsewhere."""
+        mask, mine = self.sequence.masks[frame], self.control[frame]
+        corrected = self._static(frame).depth.corrected
+        log_depth = corrected.affine(given) + self.size.enlarge(corrected.field)
+        radius = self.bleeding_px / self.size.scale[0]
+        for label in np.unique(mask[mask > 0]).tolist():
+            pixels = mask == label
+            if frame in self.broken:
+                carried = carried_moving(pixels, self.sequence.images[frame], self._beside(frame, label))
+                log_depth = np.where(np.isfinite(carried), carried, log_depth)
+                continue
+            here = (mine.instance == label) & np.isfinite(mine.log_scale)
+            log_z = mine.log_scale[here] + np.log(mine.cue[here])
+            log_depth = correct_moving(log_depth, pixels, mine.uv[here], log_z, radius, self.config)
+            log_depth = without_bleeding(log_depth, pixels, _BLED_SHARE * radius)
+        return log_depth
+
+    def _beside(self, frame: int, label: int) -> list[tuple[ImageArray, Float32Array, BoolArray, float]]:
+        """Return image, log depth and pixels of an instance, and a weight, of the nearest frames with a sound cue."""
+        found: list[tuple[ImageArray, Float32Array, BoolArray, float]] = []
+        for side in (-1, 1):
+            for step in range(1, _CARRIED_REACH + 1):
+                other = frame + side * step
+                if not 0 <= other < len(self.control) or other in self.broken:
+                    continue
+                pixels = self.sequence.masks[other] == label
+                if pixels.any():
+                    log_depth = self._moving(other, self._given(other))
+                    found.append((self.sequence.images[other], log_depth, pixels, 1.0 / step))
+                    break
+        return found
+
+    def _by_nearest_points(self, frame: int, given: Float32Array, mask: Int32Array) -> Float32Array:
+        return densify_frame(
+            given, mask, self.intrinsics[frame], self.control[frame],
+            float(self.scene["log_scale"][frame]), float(self.scene["noise"][1]), self.config,
+        )  # fmt: skip
+
+    def _static(self, frame: int) -> _Made:
+        if frame not in self.made:
+            self.made[frame] = self._make(frame)
+        return self.made[frame]
+
+    def _make(self, frame: int) -> _Made:
+        measured = None
+        if not self.unmatched:
+            measured = self.measured.pop(frame) if frame in self.measured else self.multiview.at(frame)
+        judged = self._judged(frame, measured)
+        # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
+        if not self._counts(judged.errors, self._limit(), bleeds=self.bleeding_px > 0):
+            measured = None
+        if measured is not None:
+            self.matched.add(frame)
+        if measured is not None and self.bleeding_px == 0:
+            measured = without_edges(measured, judged.cue)
+        fused = self._fused(frame, judged, measured)
+        with np.errstate(invalid="ignore"):
+            return _Made(fused, np.exp(-fused.log_depth), np.log(judged.cue), judged.unmasked)
+
+    def _judged(self, frame: int, measured: Measured | None) -> _Judged:
+        broken = frame in self.broken
+        cue = self._carried(frame) if broken else self.size.depth(self._given(frame))
+        unmasked = ~self.size.marked(self.sequence.masks[frame])
+        static = without_band(unmasked, self.config.multiview.mask_band_px)
+        uv, log_scale_at, log_cue = self._landmark_cues(frame)
+        if not broken:
+            # The cue is read where the landmark is, between pixels: its error there holds for the pixel nearest.
+            column, row = np.clip(np.rint(uv), 0, (self.size.width - 1, self.size.height - 1)).astype(np.int64).T
+            nearest = cue[row, column]
+            log_cue = np.where(np.isfinite(nearest), np.log(nearest), log_cue)
+        log_z = log_scale_at + log_cue
+        log_scale = float(self.scene["log_scale"][frame])
+        errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config)
+        return _Judged(cue, uv, log_z, unmasked, static, errors)
+
+    def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
+        known = known_depth(measured, judged.uv, judged.log_z, judged.static, judged.cue.shape)
+        like_moving = np.zeros_like(judged.static)
+        if self.bleeding_px > 0 and not judged.static.all():
+            like_moving = looks_moving(self.sequence.images[frame], self.sequence.masks[frame], judged.static)
+        log_scale = float(self.scene["log_scale"][frame])
+        return fuse_static(
+            judged.cue, measured, known, judged.errors.cue, judged.static, like_moving, log_scale, self.bleeding_px,
+            self.config,
+        )  # fmt: skip
+
+    def _bleeding(self, frame: int, judged: _Judged, measured: Measured) -> float:
+        """Return how far the cue of a frame bleeds, working px; NaN if the frame does not tell."""
+        corrected = self._fused(frame, judged, measured).corrected
+        sure = judged.static & (measured.confidence > _SURE)
+        return bleeding_radius(corrected.affine(judged.cue), measured.log_depth, sure)
+
+    @staticmethod
+    def _counts(errors: HeldOut, limit: float, *, bleeds: bool) -> bool:
+        """Tell whether matched depth is used in a frame."""
+        return errors.matching < limit or (bleeds and not errors.telling)
+
+    def _limit(self) -> float:
+        """Return the error of matched depth at landmarks, over that of the cue, below which it is used."""
+        return _NOT_WORSE if self.bleeding_px > 0 else _BETTER
+
+    def _landmark_cues(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return where a frame sees landmarks, (N, 2) working px, log depth over the cue, and the log cue (N,)."""
+        mine = self.control[frame]
+        usable = (mine.instance == 0) & np.isfinite(mine.log_scale)
+        return self.size.pixels(mine.uv[usable]), mine.log_scale[usable], np.log(mine.cue[usable])
+
+    def _carried(self, frame: int) -> Float32Array:
+        """Return a frame's depth as the nearest frames with a sound cue show it, at working size."""
+        poses: FloatArray = self.scene["world_T_cam"]
+        near = [frame + sign * step for step in range(1, _CARRIED_REACH + 1) for sign in (-1, 1)]
+        sound = [other for other in near if 0 <= other < len(poses) and other not in self.broken][:_CARRIED_FROM]
+        others = [(np.exp(self._static(other).depth.log_depth), poses[other], self._camera(other)) for other in sound]
+        shape = (self.size.height, self.size.width)
+        return carried_depth(shape, poses[frame], others, self._camera(frame))
+
+    def _camera(self, frame: int) -> FloatArray:
+        """Return intrinsics (4,) at working size."""
+        return self.size.intrinsics(self.intrinsics[frame])
+
+    def _working_frame(self, frame: int) -> WorkingFrame:
+        return working_frame(
+            self.sequence.images[frame], self.sequence.masks[frame], self.size, self.config.multiview.mask_band_px
+        )
+
+    def _landmarks(self, frame: int) -> FloatArray:
+        points: FloatArray = self.control[frame].points[self.control[frame].instance == 0]
+        return points

@@ -1,0 +1,29 @@
+"""Where the pixels of one camera are seen by another one, by their depth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+
+
+def pixel_transfer(
+    intrinsics: FloatArray, other_intrinsics: FloatArray, other_T_cam: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``turn`` (3, 3) and ``shift`` (3,): pixel (x, y, 1) at inverse depth rho is at ``turn x + rho shift``.
+
+    The last entry of that is the depth in the other camera over the one in the first.
+
+    Args:
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        other_intrinsics: (4,) those of the other camera.
+        other_T_cam: (4, 4) pose of the camera in the other one's frame.
+    """
+    to_pixels = _matrix(other_intrinsics)
+    turn: FloatArray = to_pixels @ other_T_cam[:3, :3] @ np.linalg.inv(_matrix(intrinsics))
+    return turn, to_pixels @ other_T_cam[:3, 3]
+
+
+def _matrix(intrinsics: FloatArray) -> FloatArray:
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
