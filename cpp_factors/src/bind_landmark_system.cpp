@@ -102,6 +102,18 @@ class BoundLandmarkSystem {
     return nb::cast(out.release());
   }
 
+  nb::object settle_landmarks(const AnyArray& world_T_cam, const AnyArray& intrinsics, const AnyArray& log_scale,
+                              const AnyArray& landmarks, int iterations, double min_diagonal, double max_diagonal) {
+    const LandmarkState state = read_state(world_T_cam, intrinsics, log_scale, landmarks);
+    if (iterations < 0) refuse("iterations: expected a number that is not negative, got " + std::to_string(iterations));
+    expect_damping_bounds(min_diagonal, max_diagonal);
+    NewArray out({static_cast<std::size_t>(system_->problem().num_landmarks), 3});
+    alone([&](LandmarkSystem& system) {
+      system.settle_landmarks(state, {0.0, min_diagonal, max_diagonal}, iterations, out.data());
+    });
+    return nb::cast(out.release());
+  }
+
   nb::tuple linearize(const AnyArray& world_T_cam, const AnyArray& intrinsics, const AnyArray& log_scale,
                       const AnyArray& landmarks) {
     const LandmarkState state = read_state(world_T_cam, intrinsics, log_scale, landmarks);
@@ -173,9 +185,7 @@ class BoundLandmarkSystem {
     alone(expect_linearized);
     if (!std::isfinite(damping) || damping < 0.0)
       refuse("damping: expected a finite number that is not negative, got " + std::to_string(damping));
-    if (!(min_diagonal >= 0.0) || !(max_diagonal >= min_diagonal))
-      refuse("min_diagonal, max_diagonal: expected 0 <= min <= max, got " + std::to_string(min_diagonal) + " and " +
-             std::to_string(max_diagonal));
+    expect_damping_bounds(min_diagonal, max_diagonal);
     const LandmarkProblem& problem = system_->problem();
     const std::int64_t size = problem.num_columns;
     // Read only, although the type that input and output share says otherwise.
@@ -242,6 +252,12 @@ class BoundLandmarkSystem {
     return view;
   }
 
+  static void expect_damping_bounds(double min_diagonal, double max_diagonal) {
+    if (!(min_diagonal >= 0.0) || !(max_diagonal >= min_diagonal))
+      refuse("min_diagonal, max_diagonal: expected 0 <= min <= max, got " + std::to_string(min_diagonal) + " and " +
+             std::to_string(max_diagonal));
+  }
+
   static void expect_linearized(const LandmarkSystem& system) {
     if (!system.linearized()) refuse("call linearize first");
   }
@@ -268,6 +284,10 @@ void bind_landmark_system(nb::module_& module) {
            "Plan the factors: batches are (pose, landmark, uv or depth, sigma, weight, kernel code, threshold).")
       .def("energies", &BoundLandmarkSystem::energies, nb::arg("world_T_cam"), nb::arg("intrinsics"),
            nb::arg("log_scale"), nb::arg("landmarks"), "Energy per batch, reprojection batches first.")
+      .def("settle_landmarks", &BoundLandmarkSystem::settle_landmarks, nb::arg("world_T_cam"), nb::arg("intrinsics"),
+           nb::arg("log_scale"), nb::arg("landmarks"), nb::arg("iterations"), nb::arg("min_diagonal"),
+           nb::arg("max_diagonal"),
+           "Return landmarks (N, 3), every free one moved towards its own minimum under resting cameras.")
       .def("linearize", &BoundLandmarkSystem::linearize, nb::arg("world_T_cam"), nb::arg("intrinsics"),
            nb::arg("log_scale"), nb::arg("landmarks"),
            "Return core, border, corner, gradient, largest landmark gradient, and whether all is finite.")

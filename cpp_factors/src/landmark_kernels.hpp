@@ -47,9 +47,7 @@ UNI4D_FG_INLINE Simd8 inverse_depth(const SimdDepth& depth) {
 }
 
 UNI4D_FG_INLINE Simd8 log_depth(const SimdDepth& depth) {
-  Simd8 out;
-  for (int lane = 0; lane < kSimd8Width; ++lane) out[lane] = std::log(depth.safe[lane]);
-  return out + depth.below * (1.0 / kNearPlane);
+  return natural_log(depth.safe) + depth.below * (1.0 / kNearPlane);
 }
 
 UNI4D_FG_INLINE Simd8 field(const double* data, Field which) { return load_simd8(data + which * kSimd8Width); }

@@ -26,6 +26,13 @@ void linearize_depth(const PassInput&, const LandmarkChunk&, double*, double*, d
 void linearize_intrinsics(const PassInput&, const LandmarkChunk&, double*, double*, double*);
 void linearize_depth_intrinsics(const PassInput&, const LandmarkChunk&, double*, double*, double*);
 
+/// Move each free landmark of a chunk, of landmarks (N, 3), by up to `iterations` steps under resting cameras; no step
+/// raises its energy.
+void settle_points(const PassInput& in, const LandmarkChunk& chunk, const DampingBounds& bounds, int iterations,
+                   double* landmarks);
+void settle_points_with_depth(const PassInput& in, const LandmarkChunk& chunk, const DampingBounds& bounds,
+                              int iterations, double* landmarks);
+
 /// Rows L^{-1} E^T of a chunk's pairs, (pairs, 3, 8), from its coupling blocks and its landmarks' factors (64, 6).
 void whiten_pairs(const LandmarkChunk& chunk, const double* coupling, const double* factors, double* whitened);
 

@@ -127,6 +127,20 @@ void LandmarkSystem::energies(const LandmarkState& state, double* out) const {
   }
 }
 
+void LandmarkSystem::settle_landmarks(const LandmarkState& state, const DampingBounds& bounds, int iterations,
+                                      double* landmarks) const {
+  std::copy_n(state.landmarks, 3 * static_cast<std::size_t>(problem_.num_landmarks), landmarks);
+  const landmark_passes::PassInput in{state, reprojection_kernels_.data(), depth_kernels_.data()};
+  const auto settle = num_depth_ > 0 ? landmark_passes::settle_points_with_depth : landmark_passes::settle_points;
+  parallel_for(workers(), workers(), [&](int worker, int, int) {
+    const auto w = static_cast<std::size_t>(worker);
+    for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1]; ++i) {
+      const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
+      if (!chunk.frozen) settle(in, chunk, bounds, iterations, landmarks);
+    }
+  });
+}
+
 LinearizeResult LandmarkSystem::linearize(const LandmarkState& state, const CameraSystem& system) {
   linearized_ = reduced_ = false;
   const landmark_passes::PassInput in{state, reprojection_kernels_.data(), depth_kernels_.data()};

@@ -156,11 +156,23 @@ def test_malformed_plans_are_refused_by_name(data: st.DataObject, seed: int) -> 
 
 
 @settings(max_examples=100, deadline=None)
-@given(data=st.data(), method=st.sampled_from(("energies", "linearize")))
+@given(data=st.data(), method=st.sampled_from(("energies", "linearize", "settle_landmarks")))
 def test_malformed_states_are_refused_by_name(data: st.DataObject, method: str) -> None:
     rng = np.random.default_rng(0)
     system = make_system(make_plan(rng))
-    check(lambda arguments: getattr(system, method)(**arguments), make_state(rng), data)
+    more = {"iterations": 3, "min_diagonal": 1e-6, "max_diagonal": 1e32} if method == "settle_landmarks" else {}
+    check(lambda arguments: getattr(system, method)(**arguments, **more), make_state(rng), data)
+
+
+def test_steps_of_landmarks_are_checked() -> None:
+    rng = np.random.default_rng(0)
+    system, state = make_system(make_plan(rng)), make_state(rng)
+    with pytest.raises(ValueError, match="iterations"):
+        system.settle_landmarks(**state, iterations=-1, min_diagonal=1e-6, max_diagonal=1e32)
+    with pytest.raises(ValueError, match="min_diagonal"):
+        system.settle_landmarks(**state, iterations=1, min_diagonal=1.0, max_diagonal=0.5)
+    rest = system.settle_landmarks(**state, iterations=0, min_diagonal=1e-6, max_diagonal=1e32)
+    np.testing.assert_array_equal(rest, state["landmarks"])
 
 
 @settings(max_examples=100, deadline=None)

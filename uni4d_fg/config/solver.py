@@ -32,6 +32,12 @@ class SolverConfig(Section):
     max_damping: float = setting(1e10, "Damping above which the solve stops with 'damping limit'.", gt=0)
     min_diagonal: float = setting(1e-6, "Floor of the Hessian's diagonal used for damping.", gt=0)
     max_diagonal: float = setting(1e32, "Ceiling of the Hessian's diagonal used for damping.", gt=0)
+    landmark_steps: int = setting(
+        0,
+        "Landmarks that are eliminated only: after each step every landmark moves on alone by up to this many, while "
+        "the other variables rest. Pays where little couples them; GTSAM's own optimizers do not.",
+        ge=0,
+    )
     kernel_curvature: float = setting(
         0.0,
         "Moving points only: part of the robust kernels' curvature that the steps account for once one has lowered "

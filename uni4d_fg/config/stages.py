@@ -158,8 +158,8 @@ class BundleAdjustmentConfig(Section):
     )
     solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.", basic=True)
     structure_solver: SolverConfig = setting(
-        SolverConfig(max_iterations=40, relative_decrease=1e-6),
-        "Solver of 'refine': nothing couples the landmarks but the scales, and small steps still pay.",
+        SolverConfig(max_iterations=40, relative_decrease=1e-6, landmark_steps=12),
+        "Solver of 'refine': nothing couples the landmarks but the scales.",
     )
 
 

@@ -149,8 +149,15 @@ class CppSchurObjective:
         ]
 
     def retract(self, state: State, delta: dict[VariableType, FloatArray]) -> State:
-        """Return ``state`` moved by a step per variable."""
-        return state.retract(delta)
+        """Return ``state`` moved by a step per variable, landmarks then on alone if ``landmark_steps`` says so."""
+        moved = state.retract(delta)
+        # Of factors that C++ does not have it cannot tell where they pull a landmark.
+        if not self.config.landmark_steps or self._foreign.batches:
+            return moved
+        landmarks = self._system.settle_landmarks(
+            *self._arguments(moved), self.config.landmark_steps, self.config.min_diagonal, self.config.max_diagonal
+        )
+        return moved.replace({LANDMARK: landmarks})
 
     def linearize(self, state: State) -> CppSchurLinearization:
         """Accumulate the normal equations at ``state``; they are valid until the next call.

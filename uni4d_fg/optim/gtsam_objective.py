@@ -15,6 +15,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.optim.gaussian_graph import GraphLinearization, GraphObjective
 from uni4d_fg.optim.gtsam_graph import to_gtsam, variables_read
+from uni4d_fg.optim.landmark_steps import settle_points
 from uni4d_fg.optim.objective import SolvedPart
 from uni4d_fg.optim.problem import Problem
 
@@ -28,9 +29,9 @@ class GtsamObjective:
         Args:
             problem: Batches and free entries.
             state: Values of the frozen variables, and the numbers of the keys of all.
-            config: Bounds of the damping diagonal.
+            config: Bounds of the damping diagonal, steps of landmarks alone.
         """
-        self.problem = problem
+        self.problem, self.config = problem, config
         self._read = variables_read(problem, state)
         graph, _ = to_gtsam(problem, state)
         moves: dict[int, BoolArray] = {}
@@ -53,7 +54,7 @@ class GtsamObjective:
         return self._graph.linearize(state.to_values(self._read))
 
     def retract(self, state: State, delta: gtsam.VectorValues) -> State:
-        """Return ``state`` moved by ``delta``; frozen entries stay exactly as they are."""
+        """Return ``state`` moved by ``delta``, landmarks then on alone; frozen entries stay exactly as they are."""
         tangents = {}
         for variable, rows in self.problem.free_rows().items():
             columns = _columns(variable)
@@ -63,7 +64,10 @@ class GtsamObjective:
             for row, key in zip(chosen.tolist(), variable.keys(state.numbers(variable)[chosen]), strict=True):
                 tangent[row] = delta.at(key)[columns]
             tangents[variable] = np.where(self.problem.free[variable], tangent, 0.0)
-        return state.retract(tangents)
+        moved, points = state.retract(tangents), self.problem.eliminated
+        if points is None or points not in self.problem.free or not self.config.landmark_steps:
+            return moved
+        return settle_points(self.problem.batches, moved, points, self.problem.free[points].all(axis=1), self.config)
 
     def parts(self) -> list[SolvedPart]:
         """Return that GTSAM does everything."""

@@ -33,6 +33,7 @@ from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.factors.variable_types import LANDMARK
 from uni4d_fg.optim.chunks import BatchPart, Chunk, plan_chunks
 from uni4d_fg.optim.diagnosis import GAUGE_MESSAGE, null_directions_message, undetermined, undetermined_message
+from uni4d_fg.optim.landmark_steps import settle_points
 from uni4d_fg.optim.layout import DenseLayout
 from uni4d_fg.optim.objective import SolvedPart, Step
 from uni4d_fg.optim.problem import Problem
@@ -125,8 +126,11 @@ class SchurObjective:
         return out
 
     def retract(self, state: State, delta: dict[VariableType, FloatArray]) -> State:
-        """Return ``state`` moved by a step per variable."""
-        return state.retract(delta)
+        """Return ``state`` moved by a step per variable, landmarks then on alone if ``landmark_steps`` says so."""
+        moved = state.retract(delta)
+        if self.eliminate is None or not self.config.landmark_steps:
+            return moved
+        return settle_points(self.problem.batches, moved, self.eliminate, self.landmark_free, self.config)
 
     def linearize(self, state: State) -> SchurLinearization:
         """Accumulate the normal equations at ``state``; they are valid until the next call."""

@@ -63,6 +63,12 @@ class LandmarkSystem {
   /// Energy of every batch, reprojection batches first, into `out` (num_batches,).
   void energies(const LandmarkState& state, double* out) const;
 
+  /// Move every free landmark towards its own minimum under resting cameras, by up to `iterations` steps of which none
+  /// raises its energy: `landmarks` (N, 3) become those of `state`, moved. Factors that the system was not given are
+  /// not looked at; the damping of `bounds` is not read.
+  void settle_landmarks(const LandmarkState& state, const DampingBounds& bounds, int iterations,
+                        double* landmarks) const;
+
   /// Write the normal equations of the cameras (all of `system` is overwritten); keep those of the landmarks.
   LinearizeResult linearize(const LandmarkState& state, const CameraSystem& system);
 

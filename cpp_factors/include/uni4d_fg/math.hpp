@@ -26,6 +26,8 @@ namespace uni4d_fg {
 UNI4D_FG_INLINE double larger(double value, double bound) { return value > bound ? value : bound; }
 /// Smaller of a value and a bound; the value where it is NaN.
 UNI4D_FG_INLINE double at_most(double value, double bound) { return bound < value ? bound : value; }
+/// 1 where a value lies above a bound, else 0.
+UNI4D_FG_INLINE double is_above(double value, double bound) { return value > bound ? 1.0 : 0.0; }
 UNI4D_FG_INLINE double square_root(double a) { return std::sqrt(a); }
 /// log(1 + a).
 UNI4D_FG_INLINE double log_one_plus(double a) { return std::log1p(a); }

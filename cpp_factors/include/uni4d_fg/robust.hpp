@@ -100,18 +100,19 @@ UNI4D_FG_INLINE Real weight(const Kernel& kernel, const Real& squared) {
 
 /// How fast the weight falls along the residual, -s w'(s) / w(s), at most 1: a kernel's curvature is w there without it
 /// and w (1 - falloff) with it, where that is not negative.
-UNI4D_FG_INLINE double falloff(const Kernel& kernel, double squared) {
-  const double ratio = squared / (kernel.threshold * kernel.threshold);
+template <typename Real>
+UNI4D_FG_INLINE Real falloff(const Kernel& kernel, const Real& squared) {
+  const Real ratio = squared / (kernel.threshold * kernel.threshold);
   switch (kernel.kind) {
     case KernelKind::huber:
-      return ratio > 1.0 ? 1.0 : 0.0;
+      return is_above(ratio, 1.0);
     case KernelKind::cauchy:
-      return ratio < 1.0 ? 2.0 * ratio / (1.0 + ratio) : 1.0;
+      return at_most(2.0 * ratio / (1.0 + ratio), 1.0);
     case KernelKind::pseudo_huber:
     case KernelKind::norm:
       return 1.0 - 1.0 / (1.0 + ratio);
     default:
-      return 0.0;
+      return Real{};
   }
 }
 

@@ -3,6 +3,7 @@
 
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <cstring>
 #include <new>
 #include <utility>
@@ -119,17 +120,53 @@ UNI4D_FG_INLINE Simd8 at_most(const Simd8& value, double bound) {
   return out;
 }
 
+/// 1 where a value lies above a bound, else 0, per lane.
+UNI4D_FG_INLINE Simd8 is_above(const Simd8& value, double bound) {
+  Simd8 out;
+  for (int i = 0; i < kSimd8Width; ++i) out[i] = is_above(value[i], bound);
+  return out;
+}
+
 UNI4D_FG_INLINE Simd8 square_root(const Simd8& a) {
   Simd8 out;
   for (int i = 0; i < kSimd8Width; ++i) out[i] = std::sqrt(a[i]);
   return out;
 }
 
-/// log(1 + a).
-UNI4D_FG_INLINE Simd8 log_one_plus(const Simd8& a) {
+/// log(a) of finite a that are not denormal, to two units in the last place; what it returns for others is not defined.
+UNI4D_FG_INLINE Simd8 natural_log(const Simd8& a) {
+#if defined(__GNUC__) || defined(__clang__)
+  typedef std::uint64_t Bits8 __attribute__((vector_size(64)));
+  // a = 2^k m with m in [sqrt(1/2), sqrt(2)): adding moves the step of the exponent from 1 to there.
+  constexpr std::uint64_t kOne = 0x3FF0000000000000, kRootOfHalf = 0x3FE6A09E667F3BCD, kMantissa = 0x000FFFFFFFFFFFFF;
+  constexpr std::uint64_t kExponentOf2To52 = 0x4330000000000000;
+  Bits8 bits;
+  std::memcpy(&bits, &a, sizeof(bits));
+  bits += kOne - kRootOfHalf;
+  const Bits8 exponent = (bits >> 52) | kExponentOf2To52;
+  const Bits8 mantissa = (bits & kMantissa) + kRootOfHalf;
+  Simd8 k, m;
+  std::memcpy(&k, &exponent, sizeof(k));
+  std::memcpy(&m, &mantissa, sizeof(m));
+  k = k - (4503599627370496.0 + 1023.0);
+  // log m = 2 artanh(s) with s = (m - 1) / (m + 1), |s| < 0.172.
+  const Simd8 s = (m - 1.0) / (m + 1.0), z = s * s;
+  Simd8 series = broadcast(1.0 / 21.0);
+  for (int odd = 19; odd >= 3; odd -= 2) series = series * z + 1.0 / odd;
+  constexpr double kLog2High = 0x1.62e42fefa38p-1, kLog2Low = 0x1.ef35793c7673p-45;
+  return k * kLog2High + (2.0 * s + (2.0 * s * z * series + k * kLog2Low));
+#else
   Simd8 out;
-  for (int i = 0; i < kSimd8Width; ++i) out[i] = std::log1p(a[i]);
+  for (int i = 0; i < kSimd8Width; ++i) out[i] = std::log(a[i]);
   return out;
+#endif
+}
+
+/// log(1 + a) of a that are not negative.
+UNI4D_FG_INLINE Simd8 log_one_plus(const Simd8& a) {
+  const Simd8 sum = 1.0 + a;
+  // What the sum lost of a, to first order.
+  return natural_log(sum) + (a - (sum - 1.0)) / sum;
 }
 
 /// Sum of the lanes, always in the same order.
