@@ -14,7 +14,8 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.cues import TrackingConfig
-from uni4d_fg.frontend.tracks.optical_flow import comes_back, steps_ahead
+from uni4d_fg.frontend.tracks.guided_search import search
+from uni4d_fg.frontend.tracks.optical_flow import comes_back
 from uni4d_fg.frontend.tracks.registration import cut_templates, is_fast, register
 
 _LARGEST_STRETCH = 2.0
@@ -63,36 +64,39 @@ class FirstViews:
         """Forget all points but those picked by a mask or by indices."""
         self.row, self.affine = self.row[keep], self.affine[keep]
 
-    def follow(self, source: ImageArray, target: ImageArray, points: Float32Array) -> tuple[BoolArray, Float32Array]:
+    def follow(
+        self, source: ImageArray, target: ImageArray, points: Float32Array, velocity: Float32Array
+    ) -> tuple[BoolArray, Float32Array]:
         """Move the N points from one gray image to the next, to where their first views are found.
 
         Args:
             source: (H, W) uint8, the image in which the points are known.
             target: (H, W) uint8.
             points: (N, 2) px in ``source``.
+            velocity: (N, 2) px, the last step of each; NaN where it is not known.
 
         Returns:
             kept: (N,) True for the M points that passed; the views of the others are forgotten.
             moved: (M, 2) their pixels in ``target``.
         """
-        kept = np.zeros(len(points), np.bool_)
-        if len(points) == 0:
-            return kept, points
-        moved, ahead = steps_ahead(source, target, points, self.config)
-        candidate = np.flatnonzero(ahead)
-        moved = moved[candidate]
-        self.select(candidate)
-        warp, correlation = register(self.templates, self.row, target, np.concatenate((moved, self.affine), axis=1))
-        found = _is_found(warp, correlation, moved, target, self.config)
-        lost = np.flatnonzero(~found)
-        back = lost[comes_back(source, target, points[candidate[lost]], moved[lost], self.config)]
-        moved[found], self.affine[found] = warp[found, :2], warp[found, 2:]
-        self.templates[self.row[back]] = cut_templates(target, moved[back], self.config.patch_px)
-        self.affine[back] = _IDENTITY
-        found[back] = True
-        kept[candidate[found]] = True
-        self.select(found)
-        return kept, moved[found]
+        refined = np.empty_like(points)
+
+        def accept(rows: IntArray, moved: Float32Array, expected: Float32Array) -> BoolArray:
+            warp, correlation = register(
+                self.templates, self.row[rows], target, np.concatenate((moved, self.affine[rows]), axis=1)
+            )
+            found = _is_found(warp, correlation, moved, target, self.config)
+            refined[rows[found]], self.affine[rows[found]] = warp[found, :2], warp[found, 2:]
+            lost = np.flatnonzero(~found)
+            back = lost[comes_back(source, target, points[rows[lost]], moved[lost], expected[lost], self.config)]
+            refined[rows[back]], self.affine[rows[back]] = moved[back], _IDENTITY
+            self.templates[self.row[rows[back]]] = cut_templates(target, moved[back], self.config.patch_px)
+            found[back] = True
+            return found
+
+        kept, _ = search(source, target, points, velocity, accept, self.config)
+        self.select(kept)
+        return kept, refined[kept]
 
 
 def _is_found(

@@ -2,9 +2,10 @@
 
 A grid of query points is started in frames 0, ``query_interval``, 2 ``query_interval``, ... Two sweeps over
 the video follow them: one forwards, in which every grid joins as the sweep passes its frame, and one
-backwards. A step moves all live points of all grids at once, however many grids there are, and then finds their first
-views (:mod:`uni4d_fg.frontend.tracks.first_views`), so that its errors do not add up; without refinement the step is
-checked backwards, and optionally for drift. Only the two images of the step are held, the first views of live points,
+backwards. A step moves all live points of all grids at once, however many grids there are
+(:mod:`uni4d_fg.frontend.tracks.guided_search`). It is checked backwards, or with refinement ends where the first views of
+the points are (:mod:`uni4d_fg.frontend.tracks.first_views`), so that errors do not add up; optionally it is checked for
+drift. Only the two images of the step are held, the first views of live points,
 some images of the last steps for what was hidden, and for the drift check the gray query images.
 
 A point that fails a check of :mod:`uni4d_fg.frontend.tracks.optical_flow` is lost. What was hidden can be looked for
@@ -27,7 +28,8 @@ from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.bridging import Bridges
 from uni4d_fg.frontend.tracks.first_views import FirstViews, refines
-from uni4d_fg.frontend.tracks.optical_flow import has_not_drifted, move_points
+from uni4d_fg.frontend.tracks.guided_search import move_points
+from uni4d_fg.frontend.tracks.optical_flow import has_not_drifted
 from uni4d_fg.frontend.tracks.reseeding import corners_of_empty_cells
 
 Progress = Callable[[int, int], None]
@@ -132,6 +134,8 @@ class _LivePoints:
 
     track: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    velocity: Float32Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    """(N, 2) px, the last step of each point; NaN before its first one."""
     origins: list[tuple[_Queries, ImageArray]] = field(default_factory=list)
     """Where the points started, and the image there; only for the drift check."""
     views: FirstViews | None = None
@@ -145,6 +149,7 @@ class _LivePoints:
             return
         self.track = np.concatenate((self.track, queries.tracks()))
         self.points = np.concatenate((self.points, queries.points))
+        self.velocity = np.concatenate((self.velocity, np.full_like(queries.points, np.nan)))
         if refines(config):
             if self.views is None:
                 self.views = FirstViews(config)
@@ -155,10 +160,10 @@ class _LivePoints:
     def move(self, source: ImageArray, target: ImageArray, config: TrackingConfig) -> None:
         """Follow all points to the next image and forget those that are lost."""
         if self.views is None:
-            kept, self.points = move_points(source, target, self.points, config)
+            kept, moved = move_points(source, target, self.points, self.velocity, config)
         else:
-            kept, self.points = self.views.follow(source, target, self.points)
-        self.track = self.track[kept]
+            kept, moved = self.views.follow(source, target, self.points, self.velocity)
+        self.track, self.points, self.velocity = self.track[kept], moved, moved - self.points[kept]
         if config.bridge_frames:
             self._bridge(target, config)
         if config.max_drift_px is None:
@@ -172,7 +177,7 @@ class _LivePoints:
             if keep[members].any():
                 alive.append((queries, image))
         self.origins = alive
-        self.track, self.points = self.track[keep], self.points[keep]
+        self.track, self.points, self.velocity = self.track[keep], self.points[keep], self.velocity[keep]
         if self.views is not None:
             self.views.select(keep)
 
@@ -185,6 +190,7 @@ class _LivePoints:
             return
         self.track = np.concatenate((self.track, again))
         self.points = np.concatenate((self.points, where))
+        self.velocity = np.concatenate((self.velocity, np.full_like(where, np.nan)))
         if self.views is not None:
             self.views.add(image, where)
 

@@ -1,4 +1,4 @@
-"""One step of Lucas-Kanade between two images, and the checks that a point has to pass."""
+"""Lucas-Kanade between two images, and the checks that a point has to pass."""
 
 from __future__ import annotations
 
@@ -8,54 +8,57 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
 from uni4d_fg.config.cues import TrackingConfig
 
+_NEARER = 0.85
+"""A search back that begins close by must end closer, in parts of the distance that is allowed otherwise: it could
+hardly end anywhere else than near."""
+_BACK_ITERATIONS, _BACK_CONVERGENCE = 10, 0.1
+"""The place is compared with a distance: it need not be known better than to this part of that."""
 
-def move_points(
-    source: ImageArray, target: ImageArray, points: Float32Array, config: TrackingConfig
-) -> tuple[BoolArray, Float32Array]:
-    """Move points from one gray image to the next.
 
-    A point is dropped if its window has no texture, if the window at its new place looks different, if
-    tracking it back misses where it came from, or if it comes too close to the image border.
+def find(
+    source: ImageArray, target: ImageArray, points: Float32Array, guess: Float32Array | None, config: TrackingConfig
+) -> tuple[Float32Array, BoolArray]:
+    """Find points of one image in another.
 
     Args:
-        source: (H, W) uint8, the image in which the points are known.
+        source: (H, W) uint8.
         target: (H, W) uint8.
         points: (N, 2) px in ``source``.
+        guess: (N, 2) px in ``target``, where only the finest level of the pyramid is searched; None: all levels are.
         config: Window and checks.
 
     Returns:
-        kept: (N,) True for the M points that passed every check.
-        moved: (M, 2) their pixels in ``target``.
+        Where the points are (N, 2), px, and whether (N,) they were found, look alike, and keep their distance from the
+        border.
     """
-    kept = np.zeros(len(points), np.bool_)
-    if len(points) == 0:
-        return kept, points
-    moved, ahead = steps_ahead(source, target, points, config)
-    candidate = np.flatnonzero(ahead)
-    survivors = candidate[comes_back(source, target, points[candidate], moved[candidate], config)]
-    kept[survivors] = True
-    return kept, moved[survivors]
-
-
-def steps_ahead(
-    source: ImageArray, target: ImageArray, points: Float32Array, config: TrackingConfig
-) -> tuple[Float32Array, BoolArray]:
-    """Return where points (N, 2) of ``source`` are in ``target``, and whether (N,) they are found inside of it."""
-    moved, found = _flow(source, target, points, None, config)
+    moved, found, difference = _flow(source, target, points, guess, config)
     height, width = target.shape
-    border = config.border_px
-    inside = (moved >= border).all(axis=1) & (moved <= (width - 1 - border, height - 1 - border)).all(axis=1)
-    return moved, np.asarray(found & inside)
+    limit = (width - 1 - config.border_px, height - 1 - config.border_px)
+    inside = (moved >= config.border_px).all(axis=1) & (moved <= limit).all(axis=1)
+    return moved, np.asarray(found & inside & (difference <= config.max_patch_error))
 
 
 def comes_back(
-    source: ImageArray, target: ImageArray, points: Float32Array, moved: Float32Array, config: TrackingConfig
+    source: ImageArray,
+    target: ImageArray,
+    points: Float32Array,
+    moved: Float32Array,
+    expected: Float32Array,
+    config: TrackingConfig,
 ) -> BoolArray:
-    """Return (N,) whether points (N, 2) that moved to (N, 2) are led back to where they came from."""
-    if len(points) == 0:
-        return np.zeros(0, np.bool_)
-    back, found = _flow(target, source, moved, None, config)
-    return np.asarray(found & (np.linalg.norm(back - points, axis=1) <= config.forward_backward_px))
+    """Return (N,) whether points (N, 2) that moved to (N, 2) are led back to where they came from.
+
+    The search begins where the motion (N, 2) px that was expected would have begun, and goes through the whole pyramid
+    where it is NaN. An expectation that knows of the step that is checked would make this no check.
+    """
+    result = np.zeros(len(points), np.bool_)
+    told = np.isfinite(expected[:, 0])
+    for rows, nearer in ((told, _NEARER), (~told, 1.0)):
+        guess = moved[rows] - expected[rows] if nearer < 1.0 else None
+        back, found, _ = _flow(target, source, moved[rows], guess, config, roughly=True)
+        distance = np.linalg.norm(back - points[rows], axis=1)
+        result[rows] = found & (distance <= nearer * config.forward_backward_px)
+    return result
 
 
 def has_not_drifted(
@@ -82,8 +85,12 @@ def has_not_drifted(
     """
     if config.max_drift_px is None or len(points) == 0:
         return np.ones(len(points), np.bool_)
-    matched, found = _flow(query_image, image, query_points, points, config)
-    kept: BoolArray = found & (np.linalg.norm(matched - points, axis=1) <= config.max_drift_px)
+    matched, found, difference = _flow(query_image, image, query_points, points, config)
+    kept: BoolArray = (
+        found
+        & (difference <= config.max_patch_error)
+        & (np.linalg.norm(matched - points, axis=1) <= config.max_drift_px)
+    )
     return kept
 
 
@@ -93,11 +100,19 @@ def _flow(
     points: Float32Array,
     guess: Float32Array | None,
     config: TrackingConfig,
-) -> tuple[Float32Array, BoolArray]:
-    """Return moved points (N, 2) and whether (N,) they were found and look alike.
+    roughly: bool = False,
+) -> tuple[Float32Array, BoolArray, Float32Array]:
+    """Return moved points (N, 2), whether (N,) they were found, and the mean difference (N,) of gray levels there.
 
-    With a guess of the result (N, 2) only the finest level of the pyramid is searched.
+    With a guess of the result (N, 2) only the finest level of the pyramid is searched; then ``roughly`` ends it as soon
+    as a check backwards can tell, and leaves out the difference.
     """
+    if len(points) == 0:
+        return points.copy(), np.zeros(0, np.bool_), np.zeros(0, np.float32)
+    iterations, convergence_px = config.max_iterations, config.convergence_px
+    if roughly:
+        iterations = min(iterations, _BACK_ITERATIONS)
+        convergence_px = max(convergence_px, _BACK_CONVERGENCE * config.forward_backward_px)
     moved, status, difference = cv2.calcOpticalFlowPyrLK(
         source,
         target,
@@ -105,13 +120,10 @@ def _flow(
         None if guess is None else guess.copy(),  # overwritten with the result
         winSize=(config.window_px, config.window_px),
         maxLevel=config.pyramid_levels if guess is None else 0,
-        criteria=(
-            cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT,
-            config.max_iterations,
-            config.convergence_px,
-        ),
-        flags=0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, convergence_px),
+        # OpenCV looks at the windows once more for their difference unless it is asked for eigenvalues in its place.
+        flags=(0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW)
+        | (cv2.OPTFLOW_LK_GET_MIN_EIGENVALS if roughly else 0),
         minEigThreshold=config.min_texture,
     )
-    found = (status.ravel() > 0) & (difference.ravel() <= config.max_patch_error)
-    return moved.reshape(-1, 2), found
+    return moved.reshape(-1, 2), status.ravel() > 0, difference.ravel()

@@ -44,9 +44,9 @@ def corners_of_empty_cells(image: ImageArray, points: Float32Array, config: Trac
     inner = np.zeros((rows * side, columns * side), np.float32)
     inside = slice(margin, max(height - margin, margin)), slice(margin, max(width - margin, margin))
     inner[inside] = corner[inside]
-    cells = inner.reshape(rows, side, columns, side).swapaxes(1, 2)[empty].reshape(-1, side * side)
-    best = cells.argmax(axis=1)
     row, column = np.nonzero(empty)
+    cells = inner.reshape(rows, side, columns, side)[row, :, column].reshape(-1, side * side)
+    best = cells.argmax(axis=1)
     found = np.stack((column * side + best % side, row * side + best // side), axis=1).astype(np.float32)
     result: Float32Array = found[cells[np.arange(len(cells)), best] > least]
     return result

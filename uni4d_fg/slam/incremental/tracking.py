@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import Float32Array, ImageArray, IntArray, evenly_spread
 from uni4d_fg.config.cues import TrackingConfig
+from uni4d_fg.frontend.tracks.guided_search import move_points
 from uni4d_fg.frontend.tracks.lucas_kanade import query_grid
-from uni4d_fg.frontend.tracks.optical_flow import move_points
 from uni4d_fg.slam.incremental.model import FrameTracks
 
 
@@ -30,6 +30,8 @@ class OnlineTracker:
     """(H, W) the last image, gray."""
     track: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
+    velocity: Float32Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
+    """(N, 2) px, the last step of each point; NaN before its first one."""
     next_track: int = 0
     since_query: int = 0
 
@@ -39,8 +41,8 @@ class OnlineTracker:
             image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8
         )
         if self.previous is not None:
-            kept, self.points = move_points(self.previous, gray, self.points, self.config)
-            self.track = self.track[kept]
+            kept, moved = move_points(self.previous, gray, self.points, self.velocity, self.config)
+            self.track, self.points, self.velocity = self.track[kept], moved, moved - self.points[kept]
         if self.previous is None or self.since_query >= self.config.query_interval:
             self._start((gray.shape[0], gray.shape[1]))
             self.since_query = 0
@@ -59,4 +61,5 @@ class OnlineTracker:
             grid = grid[evenly_spread(len(grid), room)]
         self.track = np.concatenate([self.track, self.next_track + np.arange(len(grid), dtype=np.int64)])
         self.points = np.concatenate([self.points, grid])
+        self.velocity = np.concatenate([self.velocity, np.full_like(grid, np.nan)])
         self.next_track += len(grid)
