@@ -7,12 +7,16 @@ for their normal noise are not touched.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
+
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, Int32Array
 from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray
 from uni4d_fg.cues.mask_distance import PackedDistance, carried_distance, overlap, shrunk_mask, signed_distance
 from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.optim.threads import map_in_order, thread_count
 
 _UNSTABLE_PX = 1.5
 """Borders that are this far from those of the frames beside, median over the frames, flicker: working px. Masks of good
@@ -25,6 +29,8 @@ _LEAST_PX = 24
 """Area of a mask, working px."""
 _REACH = 2
 """Frames before and after that are averaged."""
+_TOGETHER = 8
+"""Frames of each thread that are held at a time."""
 _OVERLAP = 0.4
 """Intersection over union of a mask with one that is carried over: where it is less, flow has failed."""
 
@@ -58,40 +64,71 @@ def averaged_masks(
     Raises:
         InputError: If a frame or mask cannot be read.
     """
-    flow, recent = DenseFlow(), _Recent(images, masks, size)
     averages: dict[int, dict[int, PackedDistance]] = {label: {} for label in labels}
     ways: dict[int, list[tuple[float, float]]] = {label: [] for label in labels}
-    for frame in range(len(masks)):
-        gray, mask = recent.at(frame)
-        present = [label for label in labels if np.count_nonzero(mask == label) >= _LEAST_PX]
-        if not present:
-            continue
-        beside = [other for other in range(frame - _REACH, frame + _REACH + 1) if 0 <= other < len(masks)]
-        flows = {other: flow.between(gray, recent.at(other)[0]) for other in beside if other != frame}
-        for label in present:
-            own: BoolArray = mask == label
-            distance = signed_distance(own)
-            carried = {}
-            for other, shift in flows.items():
-                there = recent.at(other)[1] == label
-                if np.count_nonzero(there) >= _LEAST_PX:
-                    moved = carried_distance(there, shift)
-                    if overlap(own, moved > 0) >= _OVERLAP:
-                        carried[other] = moved
-            if frame - 1 in carried and frame + 1 in carried:
-                border = max(1.0, np.count_nonzero(np.abs(distance) < 1.0) / 2)
-                usual = [
-                    sum(np.count_nonzero(part) for part in parts) / 2
-                    for parts in zip(
-                        *((recent.at(other)[1] == label, carried[other] > 0) for other in (frame - 1, frame + 1)),
-                        strict=True,
-                    )
-                ]
-                as_given, by_flow = (abs(np.count_nonzero(own) - area) / border for area in usual)
-                ways[label].append((as_given, by_flow))
-            mean = np.mean([distance, *carried.values()], axis=0)
-            averages[label][frame] = PackedDistance.of(np.asarray(mean, np.float32))
+    near: dict[int, tuple[ImageArray, Int32Array]] = {}
+    threads = thread_count()
+    for first in range(0, len(masks), _TOGETHER * threads):
+        frames = range(first, min(first + _TOGETHER * threads, len(masks)))
+        wanted = range(max(first - _REACH, 0), min(frames.stop + _REACH, len(masks)))
+        near = {
+            number: near.get(number) or (shrunk_gray(images[number], size), shrunk_mask(masks[number], size))
+            for number in wanted
+        }
+        for frame, found in zip(
+            frames, map_in_order(partial(_averaged, near, labels), list(frames), threads), strict=True
+        ):
+            for label, (mean, way) in found.items():
+                averages[label][frame] = mean
+                ways[label] += way
     return {label: averages[label] for label, way in ways.items() if _flickers(way)}
+
+
+def _averaged(
+    near: Mapping[int, tuple[ImageArray, Int32Array]], labels: list[int], frame: int
+) -> dict[int, tuple[PackedDistance, list[tuple[float, float]]]]:
+    """Average the masks of a frame with those of the frames beside.
+
+    Args:
+        near: Gray (h, w) and label map (h, w) of the frame and of those beside.
+        labels: Instances to look at.
+        frame: Its number.
+
+    Returns:
+        By instance that is there, the mean distance, and, if flow follows it before and after, how far its border is
+        from those beside, as they are and by flow.
+    """
+    flow = DenseFlow()  # none is shared: threads would write into each other's buffers
+    gray, mask = near[frame]
+    present = [label for label in labels if np.count_nonzero(mask == label) >= _LEAST_PX]
+    beside = [other for other in range(frame - _REACH, frame + _REACH + 1) if other in near and other != frame]
+    flows = {other: flow.between(gray, near[other][0]) for other in beside} if present else {}
+    found: dict[int, tuple[PackedDistance, list[tuple[float, float]]]] = {}
+    for label in present:
+        own: BoolArray = mask == label
+        distance = signed_distance(own)
+        carried = {}
+        for other, shift in flows.items():
+            there = near[other][1] == label
+            if np.count_nonzero(there) >= _LEAST_PX:
+                moved = carried_distance(there, shift)
+                if overlap(own, moved > 0) >= _OVERLAP:
+                    carried[other] = moved
+        way: list[tuple[float, float]] = []
+        if frame - 1 in carried and frame + 1 in carried:
+            border = max(1.0, np.count_nonzero(np.abs(distance) < 1.0) / 2)
+            usual = [
+                sum(np.count_nonzero(part) for part in parts) / 2
+                for parts in zip(
+                    *((near[other][1] == label, carried[other] > 0) for other in (frame - 1, frame + 1)),
+                    strict=True,
+                )
+            ]
+            as_given, by_flow = (abs(np.count_nonzero(own) - area) / border for area in usual)
+            way.append((float(as_given), float(by_flow)))
+        mean = np.mean([distance, *carried.values()], axis=0)
+        found[label] = PackedDistance.of(np.asarray(mean, np.float32)), way
+    return found
 
 
 def _flickers(ways: list[tuple[float, float]]) -> bool:
@@ -100,18 +137,3 @@ def _flickers(ways: list[tuple[float, float]]) -> bool:
         return False
     as_given, by_flow = np.median(ways, axis=0)
     return bool(by_flow > _UNSTABLE_PX and by_flow >= _NOT_FOLLOWED * as_given)
-
-
-class _Recent:
-    """Gray images and masks of the last few frames, at working size."""
-
-    def __init__(self, images: FrameSource[ImageArray], masks: FrameSource[Int32Array], size: tuple[int, int]) -> None:
-        self.images, self.masks, self.size = images, masks, size
-        self.kept: dict[int, tuple[ImageArray, Int32Array]] = {}
-
-    def at(self, frame: int) -> tuple[ImageArray, Int32Array]:
-        """Return gray (h, w) and label map (h, w) of a frame."""
-        if frame not in self.kept:
-            self.kept = {number: pair for number, pair in self.kept.items() if number >= frame - 2 * _REACH}
-            self.kept[frame] = shrunk_gray(self.images[frame], self.size), shrunk_mask(self.masks[frame], self.size)
-        return self.kept[frame]

@@ -3,10 +3,10 @@
 A grid of query points is started in frames 0, ``query_interval``, 2 ``query_interval``, ... Two sweeps over
 the video follow them: one forwards, in which every grid joins as the sweep passes its frame, and one
 backwards. A step moves all live points of all grids at once, however many grids there are
-(:mod:`uni4d_fg.frontend.tracks.guided_search`). It is checked backwards, or with refinement ends where the first views of
-the points are (:mod:`uni4d_fg.frontend.tracks.first_views`), so that errors do not add up; optionally it is checked for
-drift. Only the two images of the step are held, the first views of live points,
-some images of the last steps for what was hidden, and for the drift check the gray query images.
+(:mod:`uni4d_fg.frontend.tracks.guided_search`). It is checked backwards, or with refinement ends where the first
+views of the points are (:mod:`uni4d_fg.frontend.tracks.first_views`), so that errors do not add up; optionally it is
+checked for drift. Only the two images of the step are held, the first views of live points, some images of the last
+steps for what was hidden, and for the drift check the gray query images.
 
 A point that fails a check of :mod:`uni4d_fg.frontend.tracks.optical_flow` is lost. What was hidden can be looked for
 again (:mod:`uni4d_fg.frontend.tracks.bridging`). Where the forward sweep leaves a cell of the image empty between two
