@@ -47,8 +47,12 @@ struct TileInput {
   double* corner_tile;
 };
 void multiply_tiles(const LandmarkChunk& chunk, const TileInput& in);
-/// The same without the rows of poses, for cameras that are frozen but for their log-scales.
-void multiply_tiles_of_scales(const LandmarkChunk& chunk, const TileInput& in);
+/// Doubles of a frame's row of L^{-1} E^T where only log-scales are free: three per landmark.
+constexpr int kScaleRow = 3 * kChunkLandmarks;
+/// The same for cameras that are frozen but for their log-scales, from the coupling blocks of the chunk and its
+/// landmarks' factors (64, 6); `rows` (frames, kScaleRow) is scratch, `in.whitened` and `in.place` are not read.
+void multiply_scales(const LandmarkChunk& chunk, const double* coupling, const double* factors, double* rows,
+                     const TileInput& in);
 
 /// E^T d of a chunk's landmarks: add to (64, 3).
 void apply_coupling(const LandmarkChunk& chunk, const double* coupling, const double* frame_step, double* out);

@@ -77,6 +77,28 @@ std::vector<int> order_landmarks(const LandmarkProblem& problem) {
   return order;
 }
 
+/// Sort the entries of a chunk, which come in the order of their numbers: by place, then by frame, each time stably.
+void sort_entries(std::vector<Entry>::iterator begin, std::vector<Entry>::iterator end) {
+  if (begin == end) return;
+  const auto place = [](Entry entry) { return static_cast<std::size_t>(entry >> kNumberBits) % kChunkLandmarks; };
+  const auto frame = [](Entry entry) { return static_cast<std::size_t>(entry >> kNumberBits) / kChunkLandmarks; };
+  std::size_t lowest = frame(*begin), highest = lowest;
+  for (auto entry = begin; entry != end; ++entry) {
+    lowest = std::min(lowest, frame(*entry));
+    highest = std::max(highest, frame(*entry));
+  }
+  std::vector<Entry> other(static_cast<std::size_t>(end - begin));
+  const auto pass = [](auto from, auto to, auto out, std::size_t buckets, auto bucket) {
+    std::vector<std::size_t> next(buckets + 1, 0);
+    for (auto entry = from; entry != to; ++entry) next[bucket(*entry) + 1] += 1;
+    std::partial_sum(next.begin(), next.end(), next.begin());
+    for (auto entry = from; entry != to; ++entry)
+      *(out + static_cast<std::ptrdiff_t>(next[bucket(*entry)]++)) = *entry;
+  };
+  pass(begin, end, other.begin(), kChunkLandmarks, place);
+  pass(other.begin(), other.end(), begin, highest - lowest + 1, [&](Entry entry) { return frame(entry) - lowest; });
+}
+
 struct Record {
   int pair, layer, reprojection, depth;
   std::uint8_t landmark;
@@ -262,7 +284,7 @@ LandmarkPlan plan_landmarks(const LandmarkProblem& problem, int threads) {
     for (int i = first; i < last; ++i) {
       const auto from = entries.begin() + begin[static_cast<std::size_t>(i)];
       const auto to = entries.begin() + begin[static_cast<std::size_t>(i) + 1];
-      std::sort(from, to);
+      sort_entries(from, to);
       fill_chunk(numbers, from, to, plan.chunks[static_cast<std::size_t>(i)]);
     }
   });

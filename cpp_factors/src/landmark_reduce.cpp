@@ -1,5 +1,9 @@
 // The products of the elimination. Two frames of a chunk share the landmarks in the intersection of two bit masks;
-// their 7x8 tile of E V^{-1} E^T stays in registers over all of them.
+// their 7x8 tile of E V^{-1} E^T stays in registers over all of them. Of cameras that are frozen but for their
+// log-scales one entry of a tile is left: a product of two rows over all landmarks of the chunk.
+#include <algorithm>
+
+#include "landmark_cholesky.hpp"
 #include "landmark_passes.hpp"
 
 namespace uni4d_fg::landmark_passes {
@@ -25,8 +29,7 @@ struct Places {
   const int* column_place;  ///< null: the landmark itself
 };
 
-/// tile (7, 8) += sum over the landmarks `shared` of A^T B with A, B (3, 8); rows below First, and row 7, are not used.
-template <int First>
+/// tile (7, 8) += sum over the landmarks `shared` of A^T B with A, B (3, 8); row 7 is not used.
 UNI4D_FG_INLINE void multiply(std::uint64_t shared, const Places& at, double* tile) {
   Simd8 sums[kFrameColumns] = {};
   while (shared != 0) {
@@ -37,36 +40,39 @@ UNI4D_FG_INLINE void multiply(std::uint64_t shared, const Places& at, double* ti
     const double* b = at.columns + static_cast<std::size_t>(column) * kWidth;
     for (int k = 0; k < 3; ++k) {
       const Simd8 right = load_simd8(b + k * kSimd8Width);
-      for (int row = First; row < kFrameColumns; ++row) sums[row] += a[k * kSimd8Width + row] * right;
+      for (int row = 0; row < kFrameColumns; ++row) sums[row] += a[k * kSimd8Width + row] * right;
     }
   }
-  for (int row = First; row < kFrameColumns; ++row)
+  for (int row = 0; row < kFrameColumns; ++row)
     store_simd8(load_simd8(tile + row * kSimd8Width) + sums[row], tile + row * kSimd8Width);
 }
 
+constexpr int kScale = kFrameColumns - 1;
 constexpr std::size_t kTile = kFrameColumns * kSimd8Width;
 
-template <int First>
-UNI4D_FG_INLINE void multiply_rows(const LandmarkChunk& chunk, const TileInput& in) {
+/// The border with itself, over all landmarks of the chunk: its rows of landmarks that are not there are 0.
+UNI4D_FG_INLINE void multiply_corner(const TileInput& in) {
+  int own[kChunkLandmarks];
+  for (int i = 0; i < kChunkLandmarks; ++i) own[i] = i;
+  multiply(~std::uint64_t{0}, {in.border, own, in.border, nullptr}, in.corner_tile);
+}
+
+UNI4D_FG_INLINE void multiply_all(const LandmarkChunk& chunk, const TileInput& in) {
   const int* frames = chunk.frames.data();
   const std::uint64_t* seen = chunk.seen.data();
   const std::size_t count = chunk.frames.size();
-  std::uint64_t any = 0;
   for (std::size_t i = 0; i < count; ++i) {
     const auto frame = static_cast<std::size_t>(frames[i]);
     const int* place = in.place + i * kChunkLandmarks;
-    any |= seen[i];
-    multiply<First>(seen[i], {in.whitened, place, in.border, nullptr}, in.border_tiles + frame * kTile);
+    multiply(seen[i], {in.whitened, place, in.border, nullptr}, in.border_tiles + frame * kTile);
     for (std::size_t j = i; j < count; ++j) {
       const std::uint64_t shared = seen[i] & seen[j];
       if (shared == 0) continue;
       double* tile = in.tiles + static_cast<std::size_t>(in.tile_begin[frame] + frames[j] - frames[i]) * kTile;
-      multiply<First>(shared, {in.whitened, place, in.whitened, in.place + j * kChunkLandmarks}, tile);
+      multiply(shared, {in.whitened, place, in.whitened, in.place + j * kChunkLandmarks}, tile);
     }
   }
-  int own[kChunkLandmarks];
-  for (int i = 0; i < kChunkLandmarks; ++i) own[i] = i;
-  multiply<0>(any, {in.border, own, in.border, nullptr}, in.corner_tile);
+  multiply_corner(in);
 }
 
 }  // namespace
@@ -90,11 +96,46 @@ UNI4D_FG_WIDE_CLONES void whiten_pairs(const LandmarkChunk& chunk, const double*
 }
 
 UNI4D_FG_WIDE_CLONES void multiply_tiles(const LandmarkChunk& chunk, const TileInput& in) {
-  multiply_rows<0>(chunk, in);
+  multiply_all(chunk, in);
 }
 
-UNI4D_FG_WIDE_CLONES void multiply_tiles_of_scales(const LandmarkChunk& chunk, const TileInput& in) {
-  multiply_rows<kFrameColumns - 1>(chunk, in);
+UNI4D_FG_WIDE_CLONES void multiply_scales(const LandmarkChunk& chunk, const double* coupling, const double* factors,
+                                          double* rows, const TileInput& in) {
+  const std::uint8_t* landmark = chunk.pair_landmark.data();
+  const int* frames = chunk.frames.data();
+  const int* begin = chunk.frame_begin.data();
+  const std::uint64_t* seen = chunk.seen.data();
+  const std::size_t count = chunk.frames.size();
+  std::fill_n(rows, count * kScaleRow, 0.0);
+  for (std::size_t f = 0; f < count; ++f)
+    for (int i = begin[f]; i < begin[f + 1]; ++i) {
+      const double* e = coupling + static_cast<std::size_t>(i) * kWidth + kScale;
+      double x[3] = {e[0], e[kSimd8Width], e[2 * kSimd8Width]};
+      landmark_cholesky::solve_lower(factors + 6 * landmark[i], x);
+      double* at = rows + f * kScaleRow + 3 * landmark[i];
+      for (int k = 0; k < 3; ++k) at[k] = x[k];
+    }
+  constexpr std::size_t kEntry = kScale * kSimd8Width + kScale;
+  for (std::size_t i = 0; i < count; ++i) {
+    const double* own = rows + i * kScaleRow;
+    const auto frame = static_cast<std::size_t>(frames[i]);
+    Simd8 with_border{};
+    for (int n = 0; n < kScaleRow; ++n) with_border += own[n] * load_simd8(in.border + n * kSimd8Width);
+    double* border_row = in.border_tiles + frame * kTile + kScale * kSimd8Width;
+    store_simd8(load_simd8(border_row) + with_border, border_row);
+    double* tiles = in.tiles + in.tile_begin[frame] * static_cast<std::int64_t>(kTile) + kEntry;
+    for (std::size_t j = i; j < count; ++j) {
+      if ((seen[i] & seen[j]) == 0) continue;
+      const double* other = rows + j * kScaleRow;
+      Simd8 even{}, odd{};
+      for (int n = 0; n < kScaleRow; n += 2 * kSimd8Width) {
+        even += load_simd8(own + n) * load_simd8(other + n);
+        odd += load_simd8(own + n + kSimd8Width) * load_simd8(other + n + kSimd8Width);
+      }
+      tiles[static_cast<std::size_t>(frames[j] - frames[i]) * kTile] += sum(even + odd);
+    }
+  }
+  multiply_corner(in);
 }
 
 UNI4D_FG_WIDE_CLONES void apply_coupling(const LandmarkChunk& chunk, const double* coupling, const double* frame_step,

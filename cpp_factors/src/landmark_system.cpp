@@ -82,7 +82,8 @@ LandmarkSystem::LandmarkSystem(LandmarkProblem problem, int threads)
     for (std::size_t f = 0; f < frames; ++f)
       tile_begin_[w][f + 1] = tile_begin_[w][f] + std::max(last_frame_[w][f] - static_cast<int>(f) + 1, 0);
     tiles_[w].resize((static_cast<std::size_t>(tile_begin_[w][frames]) + frames + 1) * kTile);
-    scratch_[w].resize((most_pairs + kChunkLandmarks) * kWidth);
+    const std::size_t rows = poses_free_ ? most_pairs * kWidth : most_frames * landmark_passes::kScaleRow;
+    scratch_[w].resize(kChunkLandmarks * kWidth + rows);
     scratch_place_[w].resize(most_frames * kChunkLandmarks);
   }
 }
@@ -253,8 +254,8 @@ void LandmarkSystem::landmark_blocks(double* blocks, double* gradients) const {
 bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBounds& bounds, int worker) {
   const auto w = static_cast<std::size_t>(worker);
   double factors[6 * kChunkLandmarks];
-  double* whitened = scratch_[w].data();
-  double* border = whitened + static_cast<std::size_t>(chunk.num_pairs()) * kWidth;
+  double* border = scratch_[w].data();
+  double* whitened = border + kChunkLandmarks * kWidth;
   for (std::size_t i = 0; i < chunk.landmarks.size(); ++i) {
     const auto row = static_cast<std::size_t>(chunk.landmarks[i]);
     const double* landmark = landmarks_.data() + row * kWidth;
@@ -270,17 +271,23 @@ bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBo
     for (std::size_t j = 0; j < 3; ++j) std::fill_n(border + i * kWidth + kSimd8Width * j + kBorder + 1, 3, 0.0);
   }
   if (chunk.frames.empty()) return true;
-  landmark_passes::whiten_pairs(chunk, coupling_.data() + chunk.first_pair * kWidth, factors, whitened);
-  int* place = scratch_place_[w].data();
-  for (std::size_t f = 0; f < chunk.frames.size(); ++f)
-    for (int i = chunk.frame_begin[f]; i < chunk.frame_begin[f + 1]; ++i)
-      place[f * kChunkLandmarks + chunk.pair_landmark[static_cast<std::size_t>(i)]] = i;
+  std::fill_n(border + chunk.landmarks.size() * kWidth, (kChunkLandmarks - chunk.landmarks.size()) * kWidth, 0.0);
+  const double* coupling = coupling_.data() + chunk.first_pair * kWidth;
   double* tiles = tiles_[w].data();
   const auto frames = static_cast<std::size_t>(problem_.num_frames);
   double* border_tiles = tiles + static_cast<std::size_t>(tile_begin_[w][frames]) * kTile;
-  const auto multiply = poses_free_ ? landmark_passes::multiply_tiles : landmark_passes::multiply_tiles_of_scales;
-  multiply(
-      chunk, {whitened, border, place, tile_begin_[w].data(), tiles, border_tiles, border_tiles + frames * kTile});
+  int* place = scratch_place_[w].data();
+  const landmark_passes::TileInput input{whitened, border, place, tile_begin_[w].data(), tiles, border_tiles,
+                                         border_tiles + frames * kTile};
+  if (!poses_free_) {
+    landmark_passes::multiply_scales(chunk, coupling, factors, whitened, input);
+    return true;
+  }
+  landmark_passes::whiten_pairs(chunk, coupling, factors, whitened);
+  for (std::size_t f = 0; f < chunk.frames.size(); ++f)
+    for (int i = chunk.frame_begin[f]; i < chunk.frame_begin[f + 1]; ++i)
+      place[f * kChunkLandmarks + chunk.pair_landmark[static_cast<std::size_t>(i)]] = i;
+  landmark_passes::multiply_tiles(chunk, input);
   return true;
 }
 

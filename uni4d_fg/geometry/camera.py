@@ -15,7 +15,9 @@ error of a point behind the camera is large and its gradient pushes the point to
 
 from __future__ import annotations
 
-from uni4d_fg.arrays import Array, namespace
+import numpy as np
+
+from uni4d_fg.arrays import Array, FloatArray, IntArray, namespace
 
 NEAR_PLANE = 0.02
 """Depth in meters below which the inverse depth is continued linearly."""
@@ -91,3 +93,23 @@ def camera_to_world(world_T_cam: Array, point_cam: Array) -> Array:
     xp = namespace(point_cam)
     rotation = world_T_cam[..., :3, :3]
     return xp.einsum("...ij,...j->...i", rotation, point_cam) + world_T_cam[..., :3, 3]
+
+
+def seen_from(world_T_cam: FloatArray, frame: IntArray, points: FloatArray) -> FloatArray:
+    """Return world points (N, 3) in the axes of their camera ``frame`` (N,), of poses (T, 4, 4).
+
+    Entry by entry: a pose per point is more memory than all that is computed with it.
+    """
+    d = [points[:, j] - world_T_cam[:, j, 3][frame] for j in range(3)]
+    out = np.empty((len(points), 3))
+    for i in range(3):
+        out[:, i] = sum(world_T_cam[:, j, i][frame] * d[j] for j in range(3))
+    return out
+
+
+def lifted_from(world_T_cam: FloatArray, frame: IntArray, points: FloatArray) -> FloatArray:
+    """Return points (N, 3) in the axes of their camera ``frame`` (N,) in the world: undo :func:`seen_from`."""
+    out = np.empty((len(points), 3))
+    for i in range(3):
+        out[:, i] = sum(world_T_cam[:, i, j][frame] * points[:, j] for j in range(3)) + world_T_cam[:, i, 3][frame]
+    return out

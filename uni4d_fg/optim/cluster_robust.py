@@ -31,6 +31,7 @@ from uni4d_fg.factors.marginalization_prior import MARGINALIZATION_PRIOR
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.factors.variable_types import LANDMARK, POSE
+from uni4d_fg.optim.extension import linearize_batch
 from uni4d_fg.optim.few_clusters import blend
 from uni4d_fg.optim.layout import DenseLayout
 from uni4d_fg.optim.marginals import CameraMarginals, camera_marginals
@@ -98,11 +99,17 @@ def curvature_batch(batch: FactorBatch, state: State) -> FactorBatch:
     """Return a quadratic batch whose Hessian is the mean curvature of a robust one at ``state``."""
     if batch.kernel.kind == "quadratic" or len(batch) == 0:
         return batch
-    squared = batch.squared_norm(state)
+    return replace(batch, weight=batch.weight * _mean_curvature(batch, batch.squared_norm(state)), kernel=Kernel())
+
+
+def _mean_curvature(batch: FactorBatch, squared: FloatArray) -> FloatArray:
+    """Return the kernel's weights at squared norms (N,), scaled by the ratio of its mean slope to its mean weight."""
+    if batch.kernel.kind == "quadratic":
+        return np.ones_like(squared)
     weight = batch.kernel.weight(squared)
     slope = float(np.sum(batch.weight * batch.kernel.slope(squared, batch.factor_type.dim)))
-    ratio = max(slope / max(float(np.sum(batch.weight * weight)), 1e-300), _MIN_SLOPE)
-    return replace(batch, weight=batch.weight * weight * ratio, kernel=Kernel())
+    result: FloatArray = weight * max(slope / max(float(np.sum(batch.weight * weight)), 1e-300), _MIN_SLOPE)
+    return result
 
 
 def gradient_spread(
@@ -240,10 +247,9 @@ def _add_scores(
     for batch in batches:
         at = next(i for i, s in enumerate(batch.slots) if s.variable == eliminate)
         landmark = batch.slots[at].rows
-        r, jacobians = replace(batch, kernel=Kernel()).linearize(state)
-        squared = batch.squared_norm(state)
-        curved = curvature_batch(batch, state).weight / np.maximum(batch.weight, 1e-300)
-        weight = batch.kernel.weight(squared)
+        r, jacobians = linearize_batch(replace(batch, kernel=Kernel()), state)
+        squared = np.einsum("nd,nd->n", r, r) / np.maximum(batch.weight, 1e-300)
+        curved, weight = _mean_curvature(batch, squared), batch.kernel.weight(squared)
         curvature, weights = curvature + float(curved.sum()), weights + float(weight.sum())
         r = r * weight[:, None]
         point = jacobians[at]

@@ -67,7 +67,8 @@ class GtsamObjective:
         moved, points = state.retract(tangents), self.problem.eliminated
         if points is None or points not in self.problem.free or not self.config.landmark_steps:
             return moved
-        return settle_points(self.problem.batches, moved, points, self.problem.free[points].all(axis=1), self.config)
+        free = np.asarray(self.problem.free[points].all(axis=1))
+        return settle_points(self.problem.batches, moved, points, free, self.config)
 
     def parts(self) -> list[SolvedPart]:
         """Return that GTSAM does everything."""

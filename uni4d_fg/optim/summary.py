@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Any
 
@@ -70,8 +70,8 @@ class SolveSummary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        out = asdict(self)
+        out = {f.name: getattr(self, f.name) for f in fields(self)}
         out["termination"] = self.termination.value
-        out["iterations"] = [asdict(record) for record in self.iterations]
+        out["iterations"] = [vars(record) for record in self.iterations]
         out["initial_energy"], out["final_energy"] = self.initial_energy, self.final_energy
         return out

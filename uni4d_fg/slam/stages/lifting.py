@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
-from uni4d_fg.geometry.camera import camera_to_world, unproject, world_to_camera
+from uni4d_fg.geometry.camera import lifted_from, seen_from, unproject
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras
 
@@ -22,8 +22,7 @@ def lift(observations: Observations, cameras: Cameras) -> FloatArray:
     """
     depth = observations.depth * np.exp(cameras.log_scale[observations.frame])
     x: FloatArray = unproject(cameras.intrinsics, observations.uv, depth)
-    result: FloatArray = camera_to_world(cameras.world_T_cam[observations.frame], x)
-    return result
+    return lifted_from(cameras.world_T_cam, observations.frame, x)
 
 
 def mean_per_row(values: FloatArray, weight: FloatArray, row: IntArray, count: int) -> FloatArray:
@@ -41,7 +40,7 @@ def frame_log_scales(
     observations: Observations, world_T_cam: FloatArray, points: FloatArray, num_frames: int
 ) -> FloatArray:
     """Return per frame the median of log(z of the point) - log(cue), (T,); 0 where a frame has none."""
-    z = world_to_camera(world_T_cam[observations.frame], points)[:, 2]
+    z = seen_from(world_T_cam, observations.frame, points)[:, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.log(np.maximum(z, 1e-6)) - np.log(observations.depth)
     out = np.zeros(num_frames)

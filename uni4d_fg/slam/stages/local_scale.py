@@ -59,12 +59,14 @@ def predict_log_scale(
     if neighbors == 0:
         return whole_frame
     predicted, errors = np.zeros(len(queries)), [np.zeros(0)]
+    usable = np.flatnonzero(np.isfinite(deviation))
     for frame in range(len(frame_log_scale)):
-        known = np.flatnonzero((static.frame == frame) & np.isfinite(deviation))
+        known = usable[static.frame[usable] == frame]
         mine = np.flatnonzero(queries.frame == frame)
         if len(known) <= neighbors:
             continue
-        tree, values = cKDTree(static.uv[known]), deviation[known]
+        # Points spread over an image need no balanced tree, which takes longer to build.
+        tree, values = cKDTree(static.uv[known], balanced_tree=False), deviation[known]
         sample = evenly_spread(len(known), samples)
         _, near = tree.query(static.uv[known[sample]], k=neighbors + 1)
         errors.append(values[sample] - np.median(values[near[:, 1:]], axis=1))

@@ -71,4 +71,5 @@ def merge_tracks(state: State, observations: Observations, name: IntArray) -> tu
 
 
 def _order(observations: Observations) -> IntArray:
-    return np.lexsort([observations.frame, observations.track])
+    frames = 1 + int(observations.frame.max(initial=0))
+    return np.argsort(observations.track * frames + observations.frame, kind="stable")

@@ -40,8 +40,12 @@ class Observations:
 
     def rows(self) -> tuple[IntArray, IntArray]:
         """Return the distinct tracks (M,), ascending, and the row of each observation among them (N,)."""
-        tracks, row = np.unique(self.track, return_inverse=True)
-        return tracks, row.astype(np.int64)
+        if (self.track[1:] < self.track[:-1]).any():
+            tracks, row = np.unique(self.track, return_inverse=True)
+            return tracks, row.astype(np.int64)
+        first = np.ones(len(self), dtype=bool)
+        np.not_equal(self.track[1:], self.track[:-1], out=first[1:])
+        return self.track[first], np.cumsum(first, dtype=np.int64) - 1
 
 
 def observations_of(labelled: LabelledTracks, *labels: TrackLabel) -> Observations:

@@ -6,11 +6,10 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.stages import BundleAdjustmentConfig
-from uni4d_fg.factors.depth_prior import static_depth_prior
+from uni4d_fg.factors.depth_prior import log_depth
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
-from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.geometry.camera import NEAR_PLANE, project, seen_from
 from uni4d_fg.slam.stages.noise import intraclass_correlation, robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
@@ -18,8 +17,17 @@ from uni4d_fg.slam.stages.scene import StaticNoise
 
 def reprojection_residual(state: State, observations: Observations, row: IntArray) -> FloatArray:
     """Return the raw reprojection residual of every observation, (N, 2) px; ``row`` is its landmark's row."""
-    pose, landmark = state[POSE][observations.frame], state[LANDMARK][row]
-    residual: FloatArray = static_reprojection.residual(pose, landmark, state[INTRINSICS], uv=observations.uv)
+    return _off_by(state, observations, _in_cameras(state, observations, row))
+
+
+def _in_cameras(state: State, observations: Observations, row: IntArray) -> FloatArray:
+    """Return the landmark of every observation in the axes of its camera, (N, 3) m."""
+    return seen_from(state[POSE], observations.frame, state[LANDMARK][row])
+
+
+def _off_by(state: State, observations: Observations, x: FloatArray) -> FloatArray:
+    """Return the raw reprojection residuals (N, 2), px, of points (N, 3) in the axes of their cameras."""
+    residual: FloatArray = observations.uv - project(state[INTRINSICS][0], x)
     return residual
 
 
@@ -28,10 +36,13 @@ def landmark_errors(state: State, observations: Observations) -> Float32Array:
     tracks, row = observations.rows()
     residual = reprojection_residual(state, observations, row)
     norm = np.linalg.norm(residual, axis=1)
-    order = np.lexsort([norm, row])
-    start = np.searchsorted(row[order], np.arange(len(tracks) + 1))
+    # Bits of positive floats are in the order of the floats: one sort by row, then by norm.
+    bits = norm.astype(np.float32).view(np.uint32)
+    order = np.sort(row.astype(np.uint64) << np.uint64(32) | bits)
+    start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(tracks)))])
     middle = (start[:-1] + start[1:] - 1) // 2
-    return np.asarray(norm[order][middle], dtype=np.float32)
+    median: Float32Array = (order[middle] & np.uint64(0xFFFFFFFF)).astype(np.uint32).view(np.float32)
+    return median
 
 
 def drop_outliers(
@@ -39,8 +50,8 @@ def drop_outliers(
 ) -> tuple[State, Observations]:
     """Drop observations behind the camera, too far off, or of landmarks whose depth contradicts the cue."""
     tracks, row = observations.rows()
-    z = world_to_camera(state[POSE][observations.frame], state[LANDMARK][row])[:, 2]
-    residual = reprojection_residual(state, observations, row)
+    x = _in_cameras(state, observations, row)
+    z, residual = x[:, 2], _off_by(state, observations, x)
     behind = z <= NEAR_PLANE
     far = ~behind & (np.linalg.norm(residual, axis=1) > config.max_reprojection_px)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -67,19 +78,17 @@ def measure_noise(
 ) -> StaticNoise:
     """Measure the noise of the static scene from what is left."""
     _, row = observations.rows()
-    pose, landmark = state[POSE][observations.frame], state[LANDMARK][row]
-    reprojection = reprojection_residual(state, observations, row)
+    x = _in_cameras(state, observations, row)
     known = np.isfinite(observations.depth)
-    depth = static_depth_prior.residual(
-        pose[known], landmark[known], state[LOG_SCALE][observations.frame[known]], depth=observations.depth[known]
-    )
-    pixel, relative = robust_sigma(reprojection), robust_sigma(depth)
+    depth = log_depth(x[known, 2]) - np.log(observations.depth[known])
+    depth -= state[LOG_SCALE][observations.frame[known], 0]
+    pixel, relative = robust_sigma(_off_by(state, observations, x)), robust_sigma(depth)
     wanted = pixel * config.reprojection_sigma_factor
     sigma = max(wanted, config.min_reprojection_sigma_px)
     return StaticNoise(
         sigma,
         max(relative, config.min_depth_sigma) if np.isfinite(relative) else noise.depth_sigma,
-        intraclass_correlation(depth[:, 0], row[known]) if np.isfinite(relative) else noise.depth_correlation,
+        intraclass_correlation(depth, row[known]) if np.isfinite(relative) else noise.depth_correlation,
         sigma / max(wanted, 1e-6 * sigma),
     )
 
