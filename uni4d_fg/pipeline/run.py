@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,7 +32,7 @@ from uni4d_fg.optim.problem_io import save_stage_graph
 from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.stage_graph import RecordingRunner
-from uni4d_fg.optim.threads import one_blas_thread
+from uni4d_fg.optim.threads import one_blas_thread, thread_limit
 from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
@@ -42,12 +43,12 @@ from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.loops import loop_closing, with_loops
-from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
+from uni4d_fg.pipeline.measurements import MeasurementFiles, Measurements, read_measurements
 from uni4d_fg.pipeline.repeats import Repeats
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
-from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
+from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, WindowWorkers, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.progress import Reporter, SilentReporter
@@ -79,8 +80,10 @@ class _Run:
     sources: tuple[FactorSource, ...]
     """What is added to the stages."""
     imu: ImuSamples | None = None
-    workers: WorkerOptions | None = None
-    """Where windows are solved; None: here, with all threads."""
+    options: WorkerOptions | None = None
+    """How windows are solved; None: here, with all threads."""
+    workers: WindowWorkers | None = None
+    """Where they are, if not here."""
 
     def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord], total: int | None = None) -> Arrays:
         """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored.
@@ -218,10 +221,24 @@ def _reconstruct(
         cues=cues,
         warnings=[*cues.get("warnings", []), *measured.warnings, *warnings],
     )
+    on = None
+    if windows and not sources:
+        on = window_workers(workers, windows, sequence.image_size, run_dir / "stages", config, recorder, should_stop)
     run = _Run(
         sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter, should_stop, summary, recorder, sources, imu, workers,
+        reporter, should_stop, summary, recorder, sources, imu, workers, on,
     )  # fmt: skip
+    if on is None:
+        return _solve(run, windows, measured, run_stage)
+    with on:
+        if not resume:
+            on.start()
+        return _solve(run, windows, measured, run_stage)
+
+
+def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: StageRunner) -> RunSummary:
+    """Do all steps of a run that has been prepared."""
+    sequence, config, folder, summary = run.sequence, run.config, run.folder, run.summary
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
     key = sequence_key(sequence, run.should_stop)
@@ -234,7 +251,7 @@ def _reconstruct(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
     # What is added to stages, windows included, counts the frames of the video: none is left out there.
-    alone = config.input.repeated_frames == "auto" and not (windows or sources or imu is not None)
+    alone = config.input.repeated_frames == "auto" and not (windows or run.sources or run.imu is not None)
     repeats = Repeats.of(sequence, labelled) if alone else None
     solved, solved_tracks = sequence, labelled
     if repeats is not None:
@@ -246,7 +263,7 @@ def _reconstruct(
     loops = loop_closing(solved, camera, config)
     if loops is not None:
         # Not a source of the user's: it adds nothing to single windows, which workers may then solve.
-        run_stage = with_additions(recorder, (*sources, loops))
+        run_stage = with_additions(run.recorder, (*run.sources, loops))
     key, scene, motion = _stages(
         run, key, *camera.apply(solved, solved_tracks, config), windows, run_stage, fragments, loops
     )
@@ -306,15 +323,17 @@ def _stages(
         _forget(run, "joint")
         key = stage_key(key, config.bundle_adjustment, config.windows, *fingerprints(sources))
         before = key
-        if run.workers is not None and run.sources:
+        if run.options is not None and run.sources:
             run.summary.warnings.append(NOT_ON_WORKERS)
-        with window_workers(
-            run.workers, windows, sequence.image_size, run.store.folder / "windows", config, run.recorder,
-            run.should_stop, alone=bool(run.sources),
-        ) as workers:  # fmt: skip
+        # What is solved in this process has the threads of one task too: it does not matter where windows are solved.
+        with ExitStack() as stack:
+            if run.options is not None:
+                stack.enter_context(thread_limit(run.options.threads))
+            if run.workers is not None:
+                stack.callback(run.workers.close)
             parts = WindowedRun(
                 sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
-                run.reporter, run.should_stop, workers,
+                run.reporter, run.should_stop, run.workers,
             )  # fmt: skip
             scene = run.step(
                 "bundle_adjustment", key, lambda hooks: with_loops(loops, scene_step(parts, before, hooks))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +16,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.runners import stage_runner
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.stage_graph import RecordingRunner, StageGraph
-from uni4d_fg.optim.threads import thread_count, thread_limit
+from uni4d_fg.optim.threads import thread_count
 from uni4d_fg.pipeline.window_tasks import STOPPED
 from uni4d_fg.pipeline.workers.cluster import open_workers
 from uni4d_fg.pipeline.workers.memory import free_bytes, reconstruction_bytes, worker_count
@@ -62,42 +63,32 @@ class InOrder:
 NOT_ON_WORKERS = "windows were solved one after the other: added factors are functions of this process"
 
 
-@contextmanager
 def window_workers(
     asked: WorkerOptions | None, windows: list[Window], image_size: tuple[int, int], folder: Path, config: Config,
-    recorder: RecordingRunner, should_stop: Callable[[], bool], *, alone: bool,
-) -> Iterator[WindowWorkers | None]:  # fmt: skip
-    """Give the worker processes that windows are solved on, if any, and inside the threads of one task.
-
-    What is solved in this process has that number of threads too, so that it does not matter where windows are solved.
+    recorder: RecordingRunner, should_stop: Callable[[], bool],
+) -> WindowWorkers | None:  # fmt: skip
+    """Return the worker processes that windows are solved on; None if they are solved in this one.
 
     Args:
-        asked: What the user asked for; None: nothing, and all threads.
+        asked: What the user asked for, if anything.
         windows: All windows.
         image_size: (height, width), px.
-        folder: Of the windows' records.
+        folder: Of the stages' records; that of the windows is in it.
         config: The whole configuration.
         recorder: Takes the graphs.
         should_stop: Polled often.
-        alone: Whether windows must be solved in this process, whatever is asked for.
     """
-    if asked is None:
-        yield None
-        return
+    if asked is None or (asked.workers == 1 and asked.scheduler is None):
+        return None
     cores = max(thread_count() // asked.threads, 1)
-    with thread_limit(asked.threads):
-        if alone or (asked.workers == 1 and asked.scheduler is None):
-            yield None
-            return
-        need = reconstruction_bytes(max(map(len, windows)), image_size)
-        count = min(asked.workers or worker_count(len(windows), need, cores, free_bytes()), len(windows))
-        with WindowWorkers(asked, count, folder.resolve(), config, recorder, should_stop) as workers:
-            yield workers
+    need = reconstruction_bytes(max(map(len, windows)), image_size)
+    count = min(asked.workers or worker_count(len(windows), need, cores, free_bytes()), len(windows))
+    return WindowWorkers(asked, count, folder.resolve() / "windows", config, recorder, should_stop)
 
 
 @dataclass
 class WindowWorkers:
-    """On worker processes, which are started when they are first needed and end with the context.
+    """On worker processes, which are started when they are asked for or first needed, and end with the context.
 
     A window whose process dies or hangs is tried again. The graphs that the windows' solves leave are put together as
     if they had been solved in their order.
@@ -112,7 +103,8 @@ class WindowWorkers:
     recorder: RecordingRunner
     should_stop: Callable[[], bool]
     _stack: ExitStack = field(default_factory=ExitStack)
-    _client: Any = None
+    _opener: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
+    _client: Future[Any] | None = None
 
     def __enter__(self) -> WindowWorkers:
         return self
@@ -120,7 +112,26 @@ class WindowWorkers:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stack.close()
+        self.close()
+        self._opener.shutdown()
+
+    def close(self) -> None:
+        """End the processes; more than once does no harm."""
+        if self._client is not None:
+            # By the thread that opened them: Dask's client is bound to it.
+            self._opener.submit(self._stack.close).result()
+            self._client = None
+
+    def start(self) -> None:
+        """Start the processes, which takes seconds, while this one goes on."""
+        if self._client is None:
+            self._client = self._opener.submit(self._open)
+
+    def _open(self) -> Any:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return self._stack.enter_context(
+            open_workers(self.options, self.count, self.folder, "uni4d_fg.pipeline.window_tasks")
+        )
 
     def __call__(
         self, function: Callable[[ItemT, StageRunner, Hooks], ResultT], items: Sequence[ItemT]
@@ -132,14 +143,15 @@ class WindowWorkers:
         """
         if not items:
             return
-        if self._client is None:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._client = self._stack.enter_context(open_workers(self.options, self.count, self.folder))
+        self.start()
+        assert self._client is not None
+        client = self._client.result()
         calls = _Calls(function, items, self.config)
         traces = [self.folder / f"window_{index}.hang.txt" for index in range(len(items))]
         came_from: dict[str, int] = {}
         try:
-            for index, outcome in spread(self._client, _call, calls, self.options, traces, self.should_stop):
+            found = spread(client, _call, calls, self.options, traces, self.should_stop)
+            for index, outcome in found:
                 if isinstance(outcome, Lost):
                     raise SolverError(f"a window cannot be solved on the workers: {outcome.why}")
                 if outcome.error is not None:

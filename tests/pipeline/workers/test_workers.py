@@ -59,7 +59,8 @@ def test_tasks_that_die_hang_or_raise_cost_the_others_nothing(client: Any, tmp_p
 
 @pytest.mark.skipif(sys.platform != "linux", reason="of glibc's allocator")
 def test_large_arrays_are_not_mapped_anew_each_time(client: Any) -> None:
-    faults = client.gather([client.submit(page_faults, 200, pure=False) for _ in range(2)])
+    asked = [client.submit(page_faults, 200, pure=False) for _ in range(2)]
+    faults = [future.result(timeout=120) for future in asked]
     # 200 arrays of 4 MB are 204,800 pages.
     assert max(faults) < 20_000
 

@@ -39,7 +39,7 @@ def on_workers(
             return
         count = options.workers or fitting_workers(tasks, options.threads)
         told.begin(f"{len(tasks)} runs", len(tasks))
-        with open_workers(options, min(count, len(tasks)), Path(tasks[0].out)) as client:
+        with open_workers(options, min(count, len(tasks)), Path(tasks[0].out), run_task.__module__) as client:
             traces = [hang_file(task) for task in tasks]
             found = spread(client, run_task, tasks, options, traces, should_stop)
             for done, (index, result) in enumerate(found, start=1):

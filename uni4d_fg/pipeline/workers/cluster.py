@@ -15,17 +15,19 @@ from uni4d_fg.pipeline.workers.options import WorkerOptions
 
 _CONNECT_SECONDS = 30.0
 _START_SECONDS = 300.0
+_RESTART = "1 h"
 _PRELOAD = "uni4d_fg.pipeline.workers.guarded"
 
 
 @contextmanager
-def open_workers(options: WorkerOptions, count: int, folder: Path) -> Iterator[Any]:
+def open_workers(options: WorkerOptions, count: int, folder: Path, module: str | None = None) -> Iterator[Any]:
     """Give a ``distributed.Client`` with workers; those that were started here end with the context.
 
     Args:
         options: Where they are.
         count: Processes, if they are of this machine.
         folder: Where tasks write; workers of a cluster must see it under the same path.
+        module: Loaded as workers of this machine start, not by their first task.
 
     Raises:
         MissingDependencyError: If ``distributed`` is not installed.
@@ -39,23 +41,28 @@ def open_workers(options: WorkerOptions, count: int, folder: Path) -> Iterator[A
             client = stack.enter_context(_connect(distributed, options.scheduler))
             _check_workers(client, options.scheduler, folder)
         else:
-            client = stack.enter_context(_local(distributed, options, count))
+            client = stack.enter_context(_local(distributed, options, count, module))
         yield client
 
 
 @contextmanager
-def _local(distributed: Any, options: WorkerOptions, count: int) -> Iterator[Any]:
+def _local(distributed: Any, options: WorkerOptions, count: int, module: str | None) -> Iterator[Any]:
     import dask
 
     variables = {**dict.fromkeys(_THREAD_VARIABLES, options.threads), **_MEMORY_VARIABLES}
     environment = {f"distributed.nanny.pre-spawn-environ.{name}": str(value) for name, value in variables.items()}
-    # Retries are counted by who gives the tasks out: the scheduler says at once that a worker died.
-    changed = {"distributed.scheduler.allowed-failures": 0, **environment}
+    changed = {
+        # Retries are counted by who gives the tasks out: the scheduler says at once that a worker died.
+        "distributed.scheduler.allowed-failures": 0,
+        # A worker that is started again is given up for good if it is not there by then; a busy machine takes long.
+        "distributed.deploy.lost-worker-timeout": _RESTART,
+        **environment,
+    }
     with (
         dask.config.set(changed),
         distributed.LocalCluster(
             n_workers=count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address="127.0.0.1:0",
-            host="127.0.0.1", preload=[_PRELOAD], silence_logs=logging.CRITICAL,
+            host="127.0.0.1", preload=[_PRELOAD, *([] if module is None else [module])], silence_logs=logging.CRITICAL,
         ) as cluster,
         distributed.Client(cluster, timeout=_START_SECONDS) as client,
     ):  # fmt: skip

@@ -20,8 +20,6 @@ ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
 _POLL_SECONDS = 0.5
-_SETTLED_SECONDS = 1.0
-"""A new worker is given nothing for so long: one that dies before its nanny has heard of it is not started again."""
 _UNSTARTED = 20
 """How often a task may be given to a worker that dies before it begins."""
 
@@ -66,7 +64,6 @@ def spread(
     attempts, unstarted = [0] * len(items), [0] * len(items)
     flying: dict[Any, tuple[int, str]] = {}
     last_seen = time.monotonic()
-    since: dict[str, float] = {}
     try:
         while waiting or flying:
             if should_stop is not None and should_stop():
@@ -80,10 +77,7 @@ def spread(
                     f"{counted(len(waiting) + len(flying), 'task')} must still be done: see why the workers ended "
                     "(memory?), start others, and run the same command again; finished tasks are kept"
                 )
-            for address in present:
-                since.setdefault(address, time.monotonic())
-            settled = {address for address in present if time.monotonic() - since[address] >= _SETTLED_SECONDS}
-            idle = sorted(settled - {address for _, address in flying.values()})
+            idle = sorted(present - {address for _, address in flying.values()})
             for address in idle[: len(waiting)]:
                 index = waiting.popleft()
                 attempts[index] += 1
