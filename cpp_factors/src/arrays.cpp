@@ -109,6 +109,7 @@ std::int64_t View<T>::size() const {
 }
 template struct View<double>;
 template struct View<float>;
+template struct View<std::uint8_t>;
 template struct View<std::int64_t>;
 
 View<double> expect_floats(const AnyArray& array, const char* name, const Shape& shape, bool finite) {
@@ -133,6 +134,10 @@ View<double> expect_floats(const AnyArray& array, const char* name, const Shape&
 
 View<float> expect_singles(const AnyArray& array, const char* name, const Shape& shape) {
   return expect<float>(array, name, shape, "float32");
+}
+
+View<std::uint8_t> expect_bytes(const AnyArray& array, const char* name, const Shape& shape) {
+  return expect<std::uint8_t>(array, name, shape, "uint8");
 }
 
 View<std::int64_t> expect_integers(const AnyArray& array, const char* name, const Shape& shape) {

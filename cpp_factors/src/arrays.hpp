@@ -61,6 +61,9 @@ View<double> expect_floats(const AnyArray& array, const char* name, const Shape&
 /// Check dtype float32, C-contiguity and shape; values may be anything.
 View<float> expect_singles(const AnyArray& array, const char* name, const Shape& shape);
 
+/// The same of dtype uint8.
+View<std::uint8_t> expect_bytes(const AnyArray& array, const char* name, const Shape& shape);
+
 /// Check dtype int64, C-contiguity and shape.
 View<std::int64_t> expect_integers(const AnyArray& array, const char* name, const Shape& shape);
 

@@ -15,6 +15,7 @@ namespace {
 constexpr int kUnknown = 128;  // matching cost where nothing is known: halfway between like and unlike
 constexpr int kNoViewYet = 255;
 constexpr int kBandRows = 12;
+constexpr int kChunk = 128;  // pixels of a row that are worked on together
 
 /// What the matching of a band of rows works in.
 struct Band {
@@ -35,7 +36,7 @@ UNI4D_FG_CLONES void warp_row(const float* __restrict image, int height, int wid
   for (int x = 0; x < width; ++x) {
     const float xf = static_cast<float>(x);
     const float z = t6 * xf + c;
-    const float u = (t0 * xf + a) / z, v = (t3 * xf + b) / z;
+    const float inverse = 1.0F / z, u = (t0 * xf + a) * inverse, v = (t3 * xf + b) * inverse;
     const bool inside = (z > 0.0F) & (u >= 0.0F) & (v >= 0.0F) & (u <= right) & (v <= bottom);
     const float uc = inside ? u : 0.0F, vc = inside ? v : 0.0F;
     int i = static_cast<int>(uc), j = static_cast<int>(vc);
@@ -71,22 +72,32 @@ UNI4D_FG_CLONES void sum_rows(const float* __restrict warped, const float* __res
 UNI4D_FG_CLONES void match_row(const float* const* w, const float* const* ww, const float* const* rw, int rows,
                                int width, int radius, const float* __restrict mean, const float* __restrict variance,
                                const float* __restrict seen, float noise2, std::uint8_t* __restrict out) {
-  const float count = static_cast<float>((2 * radius + 1) * (2 * radius + 1));
-  const float share = 1.0F / count;
-  for (int x = 0; x < width; ++x) {
-    float a = 0.0F, b = 0.0F, c = 0.0F;
+  const float share = 1.0F / static_cast<float>((2 * radius + 1) * (2 * radius + 1));
+  // In separate loops per chunk: each of them becomes SIMD, which one loop over all of it does not.
+  float a[kChunk], b[kChunk], c[kChunk], cost[kChunk];
+  for (int begin = 0; begin < width; begin += kChunk) {
+    const int count = std::min(kChunk, width - begin);
     for (int k = 0; k < rows; ++k) {
-      a += w[k][x];
-      b += ww[k][x];
-      c += rw[k][x];
+      const float *__restrict wk = w[k] + begin, *__restrict wwk = ww[k] + begin, *__restrict rwk = rw[k] + begin;
+      if (k == 0) std::fill_n(a, count, 0.0F), std::fill_n(b, count, 0.0F), std::fill_n(c, count, 0.0F);
+      for (int i = 0; i < count; ++i) {
+        a[i] += wk[i];
+        b[i] += wwk[i];
+        c[i] += rwk[i];
+      }
     }
-    a *= share;
-    const float other = std::max(b * share - a * a, 0.0F);
-    const float both = c * share - a * mean[x];
-    const float zncc = both / std::sqrt((variance[x] + noise2) * (other + noise2));
-    const float cost = (1.0F - zncc) * 127.5F + 0.5F;
-    const bool known = (seen[x] > 0.0F) & (x >= radius) & (x < width - radius) & (variance[x] >= 0.0F);
-    out[x] = static_cast<std::uint8_t>(known ? std::min(std::max(cost, 0.0F), 255.0F) : static_cast<float>(kUnknown));
+    for (int i = 0; i < count; ++i) {
+      const float sum = a[i] * share, other = b[i] * share - sum * sum;
+      const float spread = other > 0.0F ? other : 0.0F;
+      const float zncc = (c[i] * share - sum * mean[begin + i]) / std::sqrt((variance[begin + i] + noise2) * (spread + noise2));
+      const float exact = (1.0F - zncc) * 127.5F + 0.5F;
+      const float low = exact > 0.0F ? exact : 0.0F;
+      const float bounded = low < 255.0F ? low : 255.0F;
+      const int x = begin + i;
+      const bool known = (seen[x] > 0.0F) & (x >= radius) & (x < width - radius) & (variance[x] >= 0.0F);
+      cost[i] = known ? bounded : static_cast<float>(kUnknown);
+    }
+    for (int i = 0; i < count; ++i) out[begin + i] = static_cast<std::uint8_t>(static_cast<int>(cost[i]));
   }
 }
 

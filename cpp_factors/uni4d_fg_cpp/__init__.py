@@ -2,8 +2,10 @@
 
 Everything is in the compiled module ``_core``: ``factor_types`` lists the factor types that have a kernel,
 ``residual`` and ``linearize`` run one by its name, ``whiten`` and ``robust_energy`` apply noise and robust kernels,
-the systems solve the stages, ``register_patches`` finds patches in an image, ``plane_sweep`` matches views and
-``compare_frames`` their depth. Arrays are float64 (row numbers int64, maps float32) and C-contiguous; a ValueError or TypeError names the argument that is not.
+the systems solve the stages, ``register_patches`` finds patches in an image, ``plane_sweep`` matches views,
+``compare_frames`` compares their depth and ``upsample_guided`` brings it to the size of the image. Arrays are float64
+(row numbers int64, maps float32, images uint8) and C-contiguous; a ValueError or TypeError names the argument that is
+not.
 """
 
 from uni4d_fg_cpp import _core
@@ -19,6 +21,7 @@ from uni4d_fg_cpp._core import (
     register_patches,
     residual,
     robust_energy,
+    upsample_guided,
     whiten,
 )
 
@@ -35,5 +38,6 @@ __all__ = [
     "register_patches",
     "residual",
     "robust_energy",
+    "upsample_guided",
     "whiten",
 ]

@@ -49,7 +49,7 @@ _BETTER = 1.0
 _NOT_WORSE = 1.5
 """... and below this one if the cue bleeds: landmarks do not lie on edges."""
 _FAR_WORSE = 4.0
-"""Above this in one frame, other frames are not tried."""
+"""If depth that was matched without comparing frames is above this in one frame, nothing more is tried."""
 _TRIED_FRAMES = 3
 """Frames that are matched first: where landmarks prefer the cue in all of them, no others are matched."""
 _SURE = 0.8
@@ -58,6 +58,7 @@ _STILL = 0.6
 """Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
 _BLED_SHARE = 2.0
 """Moving things take their depth from this many times as far inside as the cue bleeds in the mean."""
+_ADDS_NOTHING = "adds nothing to this cue, as landmarks say"
 
 
 class FinalStatic(NamedTuple):
@@ -139,17 +140,18 @@ class DenseMaps:
         if self.unmatched:
             return
         sound = [frame for frame in range(self.sequence.num_frames) if frame not in self.broken]
+        if not self.broken:
+            middle = sound[len(sound) // 2]
+            errors = self._judged(middle, self.multiview.alone(middle)).errors
+            if errors.telling and errors.matching > _FAR_WORSE:
+                self.unmatched = _ADDS_NOTHING
+                return
         tried, bled, untold = list[float](), list[float](), False
-        middle_first = sorted(
-            evenly_spread(len(sound), _TRIED_FRAMES).tolist(), key=lambda at: abs(2 * at - len(sound))
-        )
-        for at in dict.fromkeys(middle_first):
+        for at in evenly_spread(len(sound), _TRIED_FRAMES).tolist():
             measured = self.multiview.at(sound[at])
             judged = self._judged(sound[at], measured)
             tried.append(judged.errors.matching)
             untold |= not judged.errors.telling
-            if not (self.broken or untold) and judged.errors.matching > _FAR_WORSE:
-                break
             if measured is not None and self._counts(judged.errors, _NOT_WORSE, bleeds=True):
                 radius = self._bleeding(sound[at], judged, measured)
                 bled += [radius] if np.isfinite(radius) else []
@@ -157,7 +159,7 @@ class DenseMaps:
         self.bleeding_px = radius if radius > _SHARP_PX else 0.0
         limit = self._limit()
         if not (any(error < limit for error in tried) or self.broken or (untold and self.bleeding_px > 0)):
-            self.unmatched = "adds nothing to this cue, as landmarks say"
+            self.unmatched = _ADDS_NOTHING
 
     def prepare(self, frames: list[int], mapped: OrderedMap) -> None:
         """Make what :meth:`final` needs for frames that follow each other, and forget what only those before needed.

@@ -44,10 +44,11 @@ class DepthWriter:
                 f"frame {frame} of size {depth.shape} does not fit {self.num_frames} frames of {self.image_size}"
             )
         with np.errstate(invalid="ignore"):
-            stored = np.where(np.isfinite(depth) & (depth > 0.0), depth, np.nan).astype("<f4")
+            known = np.where((depth > 0.0) & (depth < np.inf), depth, np.float32(np.nan))
+        stored = np.ascontiguousarray(known, dtype="<f4")
         self.stream.seek(self.start + frame * stored.nbytes)
-        self.stream.write(stored.tobytes())
-        self.written[frame] = zlib.crc32(stored.tobytes())
+        self.stream.write(stored.data)
+        self.written[frame] = zlib.crc32(stored.data)
 
 
 @contextmanager

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
-from uni4d_fg.results.fusion.upsampling import upsample_guided
+from uni4d_fg.optim.extension import find_extension
+from uni4d_fg.results.fusion.upsampling import upsample_guided, upsample_guided_numpy
 
 
 def test_an_edge_lands_on_the_edge_of_the_image_and_a_plane_stays_a_plane(rng: np.random.Generator) -> None:
@@ -29,3 +31,43 @@ def test_what_is_missing_is_filled_from_beside_and_stays_missing_without() -> No
     image = np.zeros((20, 24, 3), np.uint8)
     np.testing.assert_allclose(upsample_guided(small, image), 2.0, rtol=1e-6)
     assert np.isnan(upsample_guided(np.full((10, 12), np.nan, np.float32), image)).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(45, 67), (20, 31)])
+def test_cpp_and_numpy_agree(rng: np.random.Generator, height: int, width: int) -> None:
+    core, reason = find_extension()
+    if core is None:
+        pytest.skip(reason)
+    values = rng.normal(1.0, 0.3, (20, 31)).astype(np.float32)
+    values[3:9, 4:9] = np.nan
+    values[15, 20] = np.inf
+    image = rng.integers(90, 130, (height, width, 3)).astype(np.uint8)
+    image[:, :9] = 255
+    colors = cv2.resize(image.astype(np.float32), (31, 20), interpolation=cv2.INTER_AREA)
+    slow = upsample_guided_numpy(values, colors, image, 0.7, 12.0)
+    for threads in (1, 3):
+        fast = core.upsample_guided(values, colors, image, spatial=0.7, color=12.0, threads=threads)
+        np.testing.assert_allclose(fast, slow, rtol=2e-5, atol=1e-6)
+    assert np.isnan(slow).any()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"values": np.ones((3, 4))}, "values: expected float32"),
+        ({"colors": np.ones((3, 4), np.float32)}, "colors: expected float32"),
+        ({"image": np.ones((6, 8, 3))}, "image: expected uint8"),
+        ({"values": np.ones((0, 4), np.float32), "colors": np.ones((0, 4, 3), np.float32)}, "values: is empty"),
+        ({"color": 0.0}, "spatial, color"),
+    ],
+)
+def test_bad_input_is_named(wrong: dict[str, object], message: str) -> None:
+    core, reason = find_extension()
+    if core is None:
+        pytest.skip(reason)
+    given = {
+        "values": np.ones((3, 4), np.float32), "colors": np.ones((3, 4, 3), np.float32),
+        "image": np.ones((6, 8, 3), np.uint8), "spatial": 0.7, "color": 12.0,
+    }  # fmt: skip
+    with pytest.raises(ValueError, match=message):
+        core.upsample_guided(**(given | wrong))

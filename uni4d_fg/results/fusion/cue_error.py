@@ -17,6 +17,7 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
+from uni4d_fg.results.fusion.wide_window import averaged, nodes, resized, sigma_on
 
 _MAX_SAMPLES = 4000
 _ITERATIONS = 12
@@ -26,8 +27,6 @@ _SHIFT_SIGMA = 0.08
 """Standard deviation of the shift, of the median inverse depth, before anything is seen."""
 _INDEPENDENT = 30
 """The smooth error makes samples alike: all of a frame say no more than this many on their own."""
-_WINDOW_NODES = 4
-"""Nodes of a grid per standard deviation of the window that is taken on it, at least."""
 _FARTHEST = 0.02
 """Least inverse depth, of the median one."""
 
@@ -158,8 +157,8 @@ def smooth_field(residual: Float32Array, weight: Float32Array, config: FusionCon
         weight: (h, w) not negative.
         config: Windows, and the strength of the wider window where little is known.
     """
-    size = _nodes(min(config.field_windows), residual.shape)
-    mass, pull = (_averaged(values, size) for values in (weight, weight * residual))
+    size = nodes(min(config.field_windows) * residual.shape[1], residual.shape)
+    mass, pull = (averaged(values, size) for values in (weight, weight * residual))
     return _field(mass, pull, residual.shape, config)
 
 
@@ -175,7 +174,7 @@ def smooth_field_of_points(
         shape: (h, w).
         config: As there.
     """
-    rows, columns = _nodes(min(config.field_windows), shape)
+    rows, columns = nodes(min(config.field_windows) * shape[1], shape)
     node = (at[0] * rows // shape[0]) * columns + at[1] * columns // shape[1]
     share = weight * (rows * columns) / (shape[0] * shape[1])
     mass, pull = (
@@ -185,42 +184,21 @@ def smooth_field_of_points(
     return _field(mass, pull, shape, config)
 
 
-def _nodes(share: float, shape: tuple[int, ...]) -> tuple[int, int]:
-    """Return the size of a grid over a map (h, w) that is fine beside a window of this part of the width."""
-    step = max(1, int(share * shape[1] / _WINDOW_NODES))
-    return max(1, round(shape[0] / step)), max(1, round(shape[1] / step))
-
-
 def _field(mass: Float32Array, pull: Float32Array, shape: tuple[int, ...], config: FusionConfig) -> Float32Array:
     """Return the field (h, w) from weights and weighted residuals on the finest grid.
 
     Each window is taken on a grid that is coarse beside it, as the mean over a window is smooth.
     """
     grids = []
-    for share in sorted(config.field_windows):
-        mass, pull = (_averaged(values, _nodes(share, shape)) for values in (mass, pull))
-        grids.append((share * mass.shape[1], mass, pull))
+    for sigma in sorted(share * shape[1] for share in config.field_windows):
+        mass, pull = (averaged(values, nodes(sigma, shape)) for values in (mass, pull))
+        grids.append((sigma_on(mass.shape, sigma, shape), mass, pull))
     field = np.zeros((1, 1), np.float32)
-    for sigma, mass, pull in reversed(grids):
-        field = _resized(field, mass.shape)
-        # Blocks and interpolation between nodes widen a window by themselves.
-        narrower = sigma if mass.shape == shape else float(np.sqrt(max(sigma**2 - 0.25, 0.1)))
-        around = cv2.GaussianBlur(np.dstack((mass, pull - mass * field)), (0, 0), narrower)
+    for on_grid, mass, pull in reversed(grids):
+        field = resized(field, mass.shape)
+        around = cv2.GaussianBlur(np.dstack((mass, pull - mass * field)), (0, 0), on_grid)
         field = field + around[..., 1] / (around[..., 0] + np.float32(config.field_prior))
-    return _resized(field, shape)
-
-
-def _averaged(values: Float32Array, shape: tuple[int, int]) -> Float32Array:
-    if values.shape == shape:
-        return values
-    return np.asarray(cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), dtype=np.float32)
-
-
-def _resized(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:
-    if values.shape == shape:
-        return values
-    resized = cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(resized, dtype=np.float32)
+    return resized(field, shape)
 
 
 def _weighted_median(values: FloatArray, weight: FloatArray) -> float:

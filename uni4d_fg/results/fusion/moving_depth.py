@@ -15,6 +15,7 @@ from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray, warp_back
 from uni4d_fg.results.fusion.carried import filled_smoothly
 from uni4d_fg.results.fusion.cue_error import smooth_field_of_points
+from uni4d_fg.results.fusion.wide_window import blurred
 
 _POINT_WEIGHT = 0.5
 """Of a trajectory's point, where a window full of sure pixels has one per pixel."""
@@ -88,8 +89,7 @@ def without_bleeding(log_depth: Float32Array, pixels: BoolArray, radius_px: floa
     known = pixels & np.isfinite(here)
     weight = np.where(known, share**6 + np.float32(1e-6), np.float32(0))
     values = np.where(known, here, np.float32(0))
-    window = (2 * int(np.ceil(_WINDOW_SIGMAS * sigma)) + 1,) * 2
-    around = cv2.GaussianBlur(np.dstack((weight * values, weight)), window, sigma)
+    around = blurred(np.dstack((weight * values, weight)), sigma)
     mean = around[..., 0] / np.maximum(around[..., 1], 1e-12)
     bled = known & (share < 1) & (values - mean > _BLED * (1 - share))
     out = log_depth.copy()

@@ -14,6 +14,7 @@ from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.bleeding import across_edges, from_nearest
 from uni4d_fg.results.fusion.cue_error import CorrectedCue, KnownDepth, correct_cue
 from uni4d_fg.results.fusion.multiview.measured import Measured
+from uni4d_fg.results.fusion.wide_window import blurred
 
 _LANDMARK_SIGMA = 0.006
 """Standard deviation of a landmark's log depth in a frame."""
@@ -301,12 +302,12 @@ def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tup
         return np.full_like(log_cue, max(usual, _LEAST_SIGMA)), np.full_like(log_cue, _USUALLY_RIGHT)
     usual = 1.4826 * float(np.median(left[usable]))
     wrong = usable & (left > 4.0 * usual + 0.02)
-    count = cv2.GaussianBlur(usable.astype(np.float32), (0, 0), _NEARBY_PX)
-    failures = cv2.GaussianBlur(wrong.astype(np.float32), (0, 0), _NEARBY_PX)
+    near = cv2.GaussianBlur(np.dstack((usable, wrong)).astype(np.float32), (0, 0), _NEARBY_PX)
+    count, failures = near[..., 0], near[..., 1]
     right = 1 - (failures + _PRIOR_SHARE * (1 - _USUALLY_RIGHT)) / (count + _PRIOR_SHARE)
     fine = usable & ~wrong
-    mass = cv2.GaussianBlur(fine.astype(np.float32), (0, 0), 4 * _NEARBY_PX)
-    squares = cv2.GaussianBlur(np.where(fine, left, np.float32(0)) ** 2, (0, 0), 4 * _NEARBY_PX)
+    far = blurred(np.dstack((fine.astype(np.float32), np.where(fine, left, np.float32(0)) ** 2)), 4 * _NEARBY_PX)
+    mass, squares = far[..., 0], far[..., 1]
     noise = np.nanmedian(measured.sigma) ** 2 + known.shared_sigma**2
     variance = (squares + _PRIOR_SHARE * usual**2) / (mass + _PRIOR_SHARE) - noise
     return np.sqrt(np.maximum(variance, _LEAST_SIGMA**2)).astype(np.float32), right.astype(np.float32)

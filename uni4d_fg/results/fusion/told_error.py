@@ -20,7 +20,7 @@ from uni4d_fg.results.fusion.log_range import log_range
 _WEIGHTS = np.array([-2.2, 0.554, 3.029, 0.499, -2.556], dtype=np.float32)
 _MANY_FRAMES = 4
 _EDGE_WINDOW = np.ones((5, 5), np.uint8)
-_STEEPEST = 0.3
+_STEEPEST = np.float32(0.3)
 _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
 _SURE_ERROR, _WRONG_ERROR = 0.0025, 0.08
 """Mean error at a probability of 1, and what a lower one adds per unit."""
@@ -36,13 +36,15 @@ def final_confidence(alone: Float32Array, averaged: Averaged) -> Float32Array:
     """
     log_depth = averaged.log_depth
     missing = ~np.isfinite(log_depth)
-    steep = np.where(missing, 0, np.clip(log_range(log_depth, _EDGE_WINDOW), 0, _STEEPEST))
-    bounded = np.clip(alone, 1e-3, 1 - 1e-3)
+    steep = np.minimum(log_range(log_depth, _EDGE_WINDOW), _STEEPEST)
+    bounded = np.clip(alone, np.float32(1e-3), np.float32(1 - 1e-3))
     share = averaged.alike / np.maximum(averaged.seeing, 1)
     seen = np.minimum(averaged.seeing, _MANY_FRAMES) / _MANY_FRAMES
-    features = np.stack([np.ones_like(share), np.log(bounded / (1 - bounded)), share, seen, steep], axis=-1)
-    probability = 1 / (1 + np.exp(-features.astype(np.float32) @ _WEIGHTS))
-    return np.where(missing, np.float32(0), probability).astype(np.float32)
+    features = np.log(bounded / (1 - bounded)), share, seen, steep
+    value = sum((weight * feature for weight, feature in zip(_WEIGHTS[1:], features, strict=True)), _WEIGHTS[0])
+    probability = 1 / (1 + np.exp(-value))
+    probability[missing] = 0
+    return np.asarray(probability, np.float32)
 
 
 @dataclass
@@ -69,9 +71,10 @@ class ToldError:
             log_z: (N,) their log depth.
         """
         counted = static & np.isfinite(log_depth)
-        sure = confidence[counted].astype(np.float64)
-        self.pixels += np.bincount(np.digitize(sure, _BINS), minlength=len(_BINS) + 1)
-        self.expected += float((_SURE_ERROR + _WRONG_ERROR * (1 - sure)).sum())
+        sure = confidence[counted]
+        above = [np.count_nonzero(sure >= np.float32(limit)) for limit in _BINS]
+        self.pixels -= np.diff([len(sure), *above, 0])
+        self.expected += (_SURE_ERROR + _WRONG_ERROR) * len(sure) - _WRONG_ERROR * float(sure.sum(dtype=np.float64))
         column, row = np.rint(uv).astype(np.int64).T
         inside = (column >= 0) & (row >= 0) & (column < static.shape[1]) & (row < static.shape[0])
         inside[inside] = counted[row[inside], column[inside]]

@@ -71,6 +71,14 @@ class MultiviewDepth:
         evidence = own.evidence.with_neighbors(averaged.agreeing, averaged.seeing)
         return Measured(averaged.log_depth, confidence(evidence), relative_sigma(evidence))
 
+    def alone(self, frame: int) -> Measured | None:
+        """Return the depth of a frame without comparing it with that of others, taken to be sure everywhere."""
+        own = self._raw(frame)
+        if own is None:
+            return None
+        sure = np.ones_like(own.inverse_depth)
+        return Measured(-np.log(own.inverse_depth), sure, relative_sigma(own.evidence))
+
     def forget_before(self, frame: int) -> None:
         """Forget what frames from this one on do not need."""
         oldest = frame - max(self.config.compared_offsets, default=0)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, evenly_spread
 from uni4d_fg.config.multiview import MultiviewConfig
-from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.geometry.camera import project
+
+_MAX_POINTS = 1000
+"""More landmarks do not tell better where a frame is seen from."""
 
 
 def choose_views(
@@ -32,6 +35,7 @@ def choose_views(
     """
     if len(points) < config.min_points:
         return []
+    points = points[evenly_spread(len(points), _MAX_POINTS)]
     height, width = image_size
     here = points - world_T_cam[frame, :3, 3]
     worth: dict[int, float] = {}
@@ -39,7 +43,7 @@ def choose_views(
         if other == frame:
             continue
         there = points - world_T_cam[other, :3, 3]
-        seen_from = world_to_camera(np.broadcast_to(world_T_cam[other], (len(points), 4, 4)), points)
+        seen_from = there @ world_T_cam[other, :3, :3]
         front = seen_from[:, 2] > 1e-6
         uv = project(intrinsics, np.where(front[:, None], seen_from, [0.0, 0.0, 1.0]))
         inside = front & (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < width) & (uv[:, 1] < height)
