@@ -8,9 +8,6 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
 from uni4d_fg.config.cues import TrackingConfig
 
-_NEARER = 0.85
-"""A search back that begins close by must end closer, in parts of the distance that is allowed otherwise: it could
-hardly end anywhere else than near."""
 _BACK_ITERATIONS, _BACK_CONVERGENCE = 10, 0.1
 """The place is compared with a distance: it need not be known better than to this part of that."""
 
@@ -53,11 +50,9 @@ def comes_back(
     """
     result = np.zeros(len(points), np.bool_)
     told = np.isfinite(expected[:, 0])
-    for rows, nearer in ((told, _NEARER), (~told, 1.0)):
-        guess = moved[rows] - expected[rows] if nearer < 1.0 else None
+    for rows, guess in ((told, moved[told] - expected[told]), (~told, None)):
         back, found, _ = _flow(target, source, moved[rows], guess, config, roughly=True)
-        distance = np.linalg.norm(back - points[rows], axis=1)
-        result[rows] = found & (distance <= nearer * config.forward_backward_px)
+        result[rows] = found & (np.linalg.norm(back - points[rows], axis=1) <= config.forward_backward_px)
     return result
 
 
