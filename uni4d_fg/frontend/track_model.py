@@ -53,7 +53,8 @@ class Tracks:
             raise InputError(f"tracks: visible must be bool, got {self.visible.dtype}")
         if self.confidence is not None and self.confidence.shape != (k, t):
             raise InputError(f"tracks: confidence {self.confidence.shape} must be ({k}, {t})")
-        if k and not bool(np.isfinite(self.uv[self.visible]).all()):
+        finite = np.isfinite(self.uv[..., 0]) & np.isfinite(self.uv[..., 1])
+        if bool((self.visible & ~finite).any()):
             raise InputError("tracks: a visible observation is NaN or infinite; mark it not visible instead")
 
     @property

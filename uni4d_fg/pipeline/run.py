@@ -391,11 +391,14 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
     sequence, config = run.sequence, run.config
     key = stage_key(key, config.tracking if sequence.tracks is None else None, config.labels, config.input)
 
+    fresh: list[LabelledTracks] = []
+
     def compute(hooks: Hooks) -> StageRecord:
         cache = run.store.folder
         tracks = load_or_track(sequence, config.tracking, cache, run.track_progress, run.should_stop)
         labelled = label_tracks(tracks, sequence, config.labels, config.input)
         save_labels(run.folder.labels, labelled)
+        fresh.append(labelled)
         counts = labelled.counts()
         facts = [", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())]
         facts += bars_note(sequence.content, sequence.image_size)
@@ -413,7 +416,7 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
     if run.resume and not _readable(lambda: load_labels(run.folder.labels)):
         run.store.discard("tracks")
     run.step("tracks", key, compute, 2 * (sequence.num_frames - 1) if sequence.tracks is None else None)
-    return key, load_labels(run.folder.labels)
+    return key, fresh[0] if fresh else load_labels(run.folder.labels)
 
 
 def _fuse(

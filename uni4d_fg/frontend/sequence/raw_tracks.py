@@ -95,7 +95,7 @@ class RawTracks:
         with np.errstate(invalid="ignore"):
             x, y = self.uv[..., 0], self.uv[..., 1]
             inside = (x >= 0) & (x < size[1]) & (y >= 0) & (y < size[0])
-        result: BoolArray = (self.visible == 1) & np.isfinite(self.uv).all(axis=2) & ~inside
+        result: BoolArray = (self.visible == 1) & np.isfinite(x) & np.isfinite(y) & ~inside
         return result
 
     def to_tracks(self, num_frames: int, size: tuple[int, int]) -> Tracks:

@@ -8,6 +8,7 @@ Only observations that are visible and away from every object border vote (see
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,10 @@ from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel, Tracks
 from uni4d_fg.frontend.tracks.depth_sampling import nearest_around, sample_depth
 from uni4d_fg.frontend.tracks.mask_certainty import UNCERTAIN, certain_labels
+from uni4d_fg.optim.threads import map_in_order, thread_count
 
+_TOGETHER = 8
+"""Frames that are held at a time."""
 _STATIC_ID = 0
 _NOT_SEEN = -2
 
@@ -56,30 +60,21 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
     found = np.full(shape, _NOT_SEEN, np.int32)
     depth = np.full(shape, np.nan, np.float32)
     behind_an_edge = np.zeros(shape, np.bool_)
-    for frame in range(num_frames):
-        mask = np.asarray(sequence.masks[frame], np.int32)
-        depth_map = sequence.depths[frame]
-        for name, array in (("mask", mask), ("depth", depth_map)):
-            if array.shape != sequence.image_size:
-                raise InputError(
-                    f"labels: {name} of frame {frame} is {array.shape}, the images are {sequence.image_size}"
-                )
-        seen = np.flatnonzero(tracks.visible[:, frame])
-        uv = tracks.uv[seen, frame]
-        certain = certain_labels(mask, config.band_static_px, config.band_dynamic_px)
-        column, row = _nearest_pixel(uv, sequence.image_size)
-        found[seen, frame] = certain[row, column]
-        depth[seen, frame] = sample_depth(
-            depth_map,
-            uv,
-            input_config.min_depth_m,
-            input_config.max_depth_m,
-            config.max_depth_spread,
-        )
-        behind_an_edge[seen, frame] = depth[seen, frame] > (
-            nearest_around(depth_map, uv, input_config.min_depth_m, config.depth_edge_px)
-            / (1.0 - config.depth_edge_step)
-        )
+    threads = thread_count()
+    for first in range(0, num_frames, _TOGETHER):
+        # Frames side by side in memory: going through all tracks once for each frame takes several times as long.
+        frames = slice(first, min(first + _TOGETHER, num_frames))
+        visible, uv = tracks.visible[:, frames].T.copy(), tracks.uv[:, frames].swapaxes(0, 1).copy()
+        pictures = [_read(sequence, frame) for frame in range(frames.start, frames.stop)]
+        seen = [np.flatnonzero(row) for row in visible]
+        looks = [
+            partial(_look, *picture, at[rows], config, input_config)
+            for picture, at, rows in zip(pictures, uv, seen, strict=True)
+        ]
+        for offset, (labels, depths, behind) in enumerate(map_in_order(lambda look: look(), looks, threads)):
+            found[seen[offset], first + offset] = labels
+            depth[seen[offset], first + offset] = depths
+            behind_an_edge[seen[offset], first + offset] = behind
 
     mask_id, votes, agreeing = _majority(found)
     agreed = (votes > 0) & (votes - agreeing <= config.max_off_label_fraction * votes)
@@ -93,6 +88,26 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
     depth[(label != TrackLabel.DYNAMIC)[:, None] & behind_an_edge] = np.nan
     weight = _weights(found, mask_id, agreed, config.band_weight)
     return LabelledTracks(tracks, label, instance, weight, depth)
+
+
+def _read(sequence: Sequence, frame: int) -> tuple[Int32Array, Float32Array]:
+    """Return the mask and the depth (H, W) of a frame, checked."""
+    mask, depth = np.asarray(sequence.masks[frame], np.int32), sequence.depths[frame]
+    for name, array in (("mask", mask), ("depth", depth)):
+        if array.shape != sequence.image_size:
+            raise InputError(f"labels: {name} of frame {frame} is {array.shape}, the images are {sequence.image_size}")
+    return mask, depth
+
+
+def _look(
+    mask: Int32Array, depth_map: Float32Array, uv: Float32Array, config: LabelConfig, input_config: InputConfig
+) -> tuple[Int32Array, Float32Array, BoolArray]:
+    """Return the certain label, the depth, and whether it is behind an edge, each (n,), at points (n, 2) px."""
+    certain = certain_labels(mask, config.band_static_px, config.band_dynamic_px)
+    column, row = _nearest_pixel(uv, (mask.shape[0], mask.shape[1]))
+    depth = sample_depth(depth_map, uv, input_config.min_depth_m, input_config.max_depth_m, config.max_depth_spread)
+    front = nearest_around(depth_map, uv, input_config.min_depth_m, config.depth_edge_px)
+    return certain[row, column], depth, np.asarray(depth > front / (1.0 - config.depth_edge_step))
 
 
 def static_frames_needed(num_frames: int, config: LabelConfig) -> int:
@@ -109,7 +124,8 @@ def _inside_image(tracks: Tracks, image_size: tuple[int, int]) -> Tracks:
     """Return the tracks with observations that round to no pixel of the image marked not visible."""
     height, width = image_size
     with np.errstate(invalid="ignore"):
-        inside = (tracks.uv >= -0.5).all(axis=-1) & (tracks.uv < (width - 0.5, height - 0.5)).all(axis=-1)
+        u, v = tracks.uv[..., 0], tracks.uv[..., 1]
+        inside = (u >= -0.5) & (v >= -0.5) & (u < width - 0.5) & (v < height - 0.5)
     visible: BoolArray = tracks.visible & inside
     uv = np.where(visible[..., None], tracks.uv, np.float32(np.nan))
     return Tracks(uv, visible, tracks.query_frame, tracks.confidence)
