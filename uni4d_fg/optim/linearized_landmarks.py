@@ -86,12 +86,12 @@ class LinearizedLandmarks:
 
     def pairs(self) -> tuple[IntArray, IntArray]:
         """Return the frames (P,) and landmarks (P,) that the factors couple, each pair once."""
-        found = [np.zeros((0, 2), dtype=np.int64)]
+        found, count = [np.zeros(0, dtype=np.int64)], max(len(self.free), 1)
         for batch, slot in zip(self.batches, self._slot, strict=True):
             landmark = batch.slots[slot].rows
-            found += [np.stack([s.rows, landmark], axis=1) for s in batch.slots if s.variable in _OF_A_FRAME]
-        both = np.unique(np.concatenate(found), axis=0)
-        return np.ascontiguousarray(both[:, 0]), np.ascontiguousarray(both[:, 1])
+            found += [s.rows * count + landmark for s in batch.slots if s.variable in _OF_A_FRAME]
+        frames, landmarks = np.divmod(np.unique(np.concatenate(found)), count)
+        return frames, landmarks
 
     def correct(self, core: Any, reduced: CameraSystem) -> None:
         """Correct a reduced system in place for the coupling that ``core`` does not know."""

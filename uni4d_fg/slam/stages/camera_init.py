@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.stages import CameraInitConfig
@@ -80,13 +79,14 @@ class PairSource:
     def held(self, frames: IntArray) -> IntArray:
         """Return the oldest frame of every part of a window (W,) that tracks hold together, ascending."""
         enough = min(_TRACKS_OF_A_POSE, 2 * self.max_tracks or _TRACKS_OF_A_POSE)
-        linked = np.zeros((len(frames), len(frames)), dtype=bool)
+        linked = np.eye(len(frames), dtype=bool)
         for a, b in zip(*np.triu_indices(len(frames), 1), strict=True):
             i, j = int(frames[a]), int(frames[b])
-            linked[a, b] = len(self.tracks(i, j)) + len(self.tracks(j, i)) >= enough
-        _, part = connected_components(linked, directed=False)
-        result: IntArray = frames[np.unique(part, return_index=True)[1]]
-        return np.sort(result)
+            linked[a, b] = linked[b, a] = len(self.tracks(i, j)) + len(self.tracks(j, i)) >= enough
+        while not np.array_equal(further := linked @ linked, linked):  # what two steps reach, four, ...
+            linked = further
+        result: IntArray = frames[np.unique(linked.argmax(axis=1))]
+        return result
 
     def forget_before(self, frame: int) -> None:
         """Drop cached pairs whose frames have left the window."""

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import FloatArray, evenly_spread
+from uni4d_fg.optim.threads import thread_count
 from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -59,6 +60,7 @@ def predict_log_scale(
     if neighbors == 0:
         return whole_frame
     predicted, errors = np.zeros(len(queries)), [np.zeros(0)]
+    threads = thread_count()
     usable = np.flatnonzero(np.isfinite(deviation))
     for frame in range(len(frame_log_scale)):
         known = usable[static.frame[usable] == frame]
@@ -68,10 +70,10 @@ def predict_log_scale(
         # Points spread over an image need no balanced tree, which takes longer to build.
         tree, values = cKDTree(static.uv[known], balanced_tree=False), deviation[known]
         sample = evenly_spread(len(known), samples)
-        _, near = tree.query(static.uv[known[sample]], k=neighbors + 1)
+        _, near = tree.query(static.uv[known[sample]], k=neighbors + 1, workers=threads)
         errors.append(values[sample] - np.median(values[near[:, 1:]], axis=1))
         if len(mine):
-            _, near = tree.query(queries.uv[mine], k=neighbors)
+            _, near = tree.query(queries.uv[mine], k=neighbors, workers=threads)
             predicted[mine] = np.median(values[near.reshape(len(mine), -1)], axis=1)
     sigma = robust_sigma(np.concatenate(errors))
     if not sigma < frame_sigma:
