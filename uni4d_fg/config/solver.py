@@ -21,7 +21,8 @@ class SolverConfig(Section):
     )
     early_relative_decrease: float | None = setting(
         None,
-        "The same for all rounds of a stage but its last (annealing, warm-up): they only lead there. Null takes "
+        "The same for all rounds of a stage but its last (annealing, warm-up), and for the first of two solves of the "
+        "structure: they only lead there. Null takes "
         "relative_decrease.",
         gt=0,
         lt=1,

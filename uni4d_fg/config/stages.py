@@ -158,7 +158,7 @@ class BundleAdjustmentConfig(Section):
     )
     solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.", basic=True)
     structure_solver: SolverConfig = setting(
-        SolverConfig(max_iterations=40, relative_decrease=1e-6, landmark_steps=12),
+        SolverConfig(max_iterations=40, relative_decrease=1e-6, early_relative_decrease=1e-4, landmark_steps=12),
         "Solver of 'refine': nothing couples the landmarks but the scales.",
     )
 

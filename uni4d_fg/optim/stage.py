@@ -150,7 +150,7 @@ def _run_schedule(
     parts: list[SolveSummary] = []
     solved_by: list[dict[str, Any]] = []
     for step in schedule:
-        solver = stage.solver if step is schedule[-1] else _early(stage.solver)
+        solver = stage.solver if step is schedule[-1] else early(stage.solver)
         state, summary, by = rounds.solve(step, state, solver, hooks)
         parts.append(summary)
         solved_by = [asdict(part) for part in by]
@@ -188,8 +188,8 @@ class LevenbergMarquardtRunner:
         return run_stage(stage, state, hooks, self.backend)
 
 
-def _early(solver: SolverConfig) -> SolverConfig:
-    """Return the solver's options for all rounds but the last."""
+def early(solver: SolverConfig) -> SolverConfig:
+    """Return the solver's options for what only leads to the solve that counts: all rounds but the last."""
     looser = solver.early_relative_decrease
     return solver if looser is None else solver.model_copy(update={"relative_decrease": looser})
 

@@ -25,7 +25,7 @@ from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POS
 from uni4d_fg.optim.added_factors import HOLDS_SCALE, joined_by
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
-from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
+from uni4d_fg.optim.stage import Stage, StageRunner, early, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.acceleration import AccelerationPrior, estimate_prior, starting_prior
 from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
@@ -276,12 +276,12 @@ def refine_structure(
 ) -> tuple[State, StaticNoise, list[SolveSummary]]:
     """Solve landmarks and frame scales under frozen cameras; return the state, the noise and the solves.
 
-    Twice: the second solve uses the depth noise that the first one reveals.
+    Twice: the second solve uses the depth noise that the first one reveals, and starts where that ended.
     """
     solves = []
-    for _ in range(2):
+    for solver in (early(config.structure_solver), config.structure_solver):
         problem = structure_problem(state, observations, noise, config)
-        state, summary = run(Stage(kind, problem, config.structure_solver), state, hooks)
+        state, summary = run(Stage(kind, problem, solver), state, hooks)
         solves.append(summary)
         noise = measure_noise(state, observations, noise, config)
     return state, noise, solves
