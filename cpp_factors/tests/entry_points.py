@@ -70,6 +70,11 @@ ENTRY_POINTS["register_patches"] = EntryPoint(
     ("weight",),
 )
 
+ENTRY_POINTS["compare_frames"] = EntryPoint(
+    lambda **a: _core.compare_frames(np.ones((4, 5), np.float32), [np.ones((4, 5), np.float32)] * 2, **a),
+    lambda rng: {"turns": rng.normal(size=(2, 3, 3)), "shifts": rng.normal(size=(2, 3)), "agree": 1.1, "alike": 1.1},
+)
+
 
 def _pairs(rng: np.random.Generator) -> dict[str, Any]:
     return {

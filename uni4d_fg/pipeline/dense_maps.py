@@ -217,7 +217,7 @@ class DenseMaps:
             # Masks reach beyond what moves: what other frames see there just the same stands still.
             if frame in self.matched:
                 moving &= self.size.enlarge(mine.depth.matched) <= _STILL
-            full[moving] = np.exp(self._moving(frame, given)[moving])
+            full[moving] = np.exp(self._moving(frame, given, mask)[moving])
         return full, FinalStatic(averaged.log_depth, sure, mine.unmasked)
 
     def landmarks_in(self, frame: int) -> tuple[FloatArray, FloatArray]:
@@ -231,9 +231,9 @@ class DenseMaps:
         with np.errstate(invalid="ignore"):
             return np.where((cue > 0.0) & (cue < np.inf), cue, np.float32(np.nan))
 
-    def _moving(self, frame: int, given: Float32Array) -> Float32Array:
+    def _moving(self, frame: int, given: Float32Array, mask: Int32Array) -> Float32Array:
         """Return the log depth (H, W) of what moves; means nothing elsewhere."""
-        mask, mine = self.sequence.masks[frame], self.control[frame]
+        mine = self.control[frame]
         corrected = self._static(frame).depth.corrected
         log_depth = corrected.affine(given) + self.size.enlarge(corrected.field)
         radius = self.bleeding_px / self.size.scale[0]
@@ -257,9 +257,10 @@ class DenseMaps:
                 other = frame + side * step
                 if not 0 <= other < len(self.control) or other in self.broken:
                     continue
-                pixels = self.sequence.masks[other] == label
+                mask = self.sequence.masks[other]
+                pixels = mask == label
                 if pixels.any():
-                    log_depth = self._moving(other, self._given(other))
+                    log_depth = self._moving(other, self._given(other), mask)
                     found.append((self.sequence.images[other], log_depth, pixels, 1.0 / step))
                     break
         return found

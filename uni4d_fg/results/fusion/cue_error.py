@@ -11,6 +11,7 @@ left over Gaussian windows, wide ones first, each shrunk towards the one before 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ from uni4d_fg.results.fusion.wide_window import averaged, nodes, resized, sigma_
 
 _MAX_SAMPLES = 4000
 _ITERATIONS = 12
+_SETTLED = 1e-4
+"""Relative change of an affine error that is no change."""
 _MIN_SAMPLES = 12
 _MAD = 1.4826
 _SHIFT_SIGMA = 0.08
@@ -79,29 +82,38 @@ def fit_affine(
         negative, is replaced by a scale alone.
     """
     inverse, wanted = 1.0 / cue, np.exp(-log_depth)
-    scale = float(np.exp(-_weighted_median(log_depth - np.log(cue), weight)))
-    typical = float(np.median(wanted))
+    median = partial(_weighted_median, weight=None if weight.min() == weight.max() > 0 else weight)
+    scale = float(np.exp(-median(log_depth - np.log(cue))))
+    typical, nearest, farthest = float(np.median(wanted)), float(inverse.min()), float(wanted.min())
     a, b = scale, 0.0
+    # Relative residuals: an error of inverse depth counts by how deep it is.
+    relative, mass = weight / wanted**2, float(weight.sum())
+    left = _log_left(a, b, inverse, log_depth)
     for _ in range(_ITERATIONS):
-        left = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
-        sigma = max(_MAD * _weighted_median(np.abs(left), weight), 1e-4)
-        # Relative residuals: an error of inverse depth counts by how deep it is.
-        w = weight / (1.0 + (left / (2.0 * sigma)) ** 2) ** 2 / wanted**2
+        sigma = max(_MAD * median(np.abs(left)), 1e-4)
+        w = relative / (1.0 + (left / (2.0 * sigma)) ** 2) ** 2
         # One more sample, of no inverse depth at none: without evidence there is no shift.
-        least = (sigma / (shift_sigma * typical)) ** 2 * weight.sum() / _INDEPENDENT
-        total = w.sum() + least
-        x, y = (w * inverse).sum() / total, (w * wanted).sum() / total
-        spread = (w * (inverse - x) ** 2).sum() + least * x**2
-        slope = ((w * (inverse - x) * (wanted - y)).sum() + least * x * y) / max(spread, 1e-12 * total)
+        least = (sigma / (shift_sigma * typical)) ** 2 * mass / _INDEPENDENT
+        total = float(w.sum()) + least
+        x, y = float(w @ inverse) / total, float(w @ wanted) / total
+        away = inverse - x
+        weighted = w * away
+        spread = float(weighted @ away) + least * x**2
+        slope = (float(weighted @ (wanted - y)) + least * x * y) / max(spread, 1e-12 * total)
         shift = y - slope * x
-        if slope <= 0.2 * scale or slope > 5.0 * scale or (slope * inverse + shift).min() <= 0.1 * wanted.min():
+        if slope <= 0.2 * scale or slope > 5.0 * scale or slope * nearest + shift <= 0.1 * farthest:
             slope, shift = scale, 0.0
-        done = abs(slope - a) + abs(shift - b) < 1e-6 * (abs(a) + abs(b))
+        done = abs(slope - a) + abs(shift - b) < _SETTLED * (abs(a) + abs(b))
         a, b = slope, shift
+        left = _log_left(a, b, inverse, log_depth)
         if done:
             break
-    left = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
-    return a, b, _MAD * _weighted_median(np.abs(left), weight)
+    return a, b, _MAD * median(np.abs(left))
+
+
+def _log_left(a: float, b: float, inverse: FloatArray, log_depth: FloatArray) -> FloatArray:
+    left: FloatArray = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
+    return left
 
 
 def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, config: FusionConfig) -> CorrectedCue:
@@ -201,8 +213,9 @@ def _field(mass: Float32Array, pull: Float32Array, shape: tuple[int, ...], confi
     return resized(field, shape)
 
 
-def _weighted_median(values: FloatArray, weight: FloatArray) -> float:
-    if weight.min() == weight.max() > 0:
+def _weighted_median(values: FloatArray, weight: FloatArray | None) -> float:
+    """Return the lower weighted median; without weights, all count alike."""
+    if weight is None:
         middle = (len(values) - 1) // 2
         return float(np.partition(values, middle)[middle])
     order = np.argsort(values)
