@@ -23,6 +23,7 @@ from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.shots.links import SmallFrame, link, pan_between, small_frame
 from uni4d_fg.frontend.shots.survival import Span, spans
+from uni4d_fg.optim.threads import map_in_order, thread_count
 
 _REST = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _BLUR_PX = 2.0
@@ -92,10 +93,10 @@ class _Search:
         """Where corners could not be followed, nor be found again soon."""
 
     def run(self) -> tuple[Cut, ...]:
-        for t in range(1, len(self.frames)):
-            connected, motion = self.connected(t - 1, t)
+        steps = map_in_order(self.step, list(range(1, len(self.frames))), thread_count())
+        for connected, followed, motion in steps:
             self.broken.append(not connected)
-            self.followed.append(connected and self.has_corners(t - 1, t, motion))
+            self.followed.append(followed)
             self.motion.append(motion if connected else _REST)
         hard = merged(self.hard_cuts(), self.config.look_around)
         sharp = [cut for cut in hard if self.is_sharp(cut)]
@@ -103,6 +104,11 @@ class _Search:
         # A short dissolve is found both ways, and its extent by the second.
         alone = [c for c in hard if not any(d.stop - 2 <= c.start and c.stop <= d.start + 2 for d in soft)]
         return tuple(merged(sorted([*alone, *soft]), self.config.look_around))
+
+    def step(self, t: int) -> tuple[bool, bool, FloatArray]:
+        """Return whether a frame is connected with the one before, whether corners are found again, and the motion."""
+        connected, motion = self.connected(t - 1, t)
+        return connected, connected and self.has_corners(t - 1, t, motion), motion
 
     def connected(self, a: int, b: int) -> tuple[bool, FloatArray]:
         """Tell whether two frames show one scene, and how pixels of the one move to the other."""
