@@ -203,6 +203,8 @@ class Viewer:
             with self._server.atomic():
                 self.panel.frame.value = (int(self.panel.frame.value) + frames) % self._run.num_frames
                 self.refresh()
+            # At once: viser collects messages for a sixtieth of a second.
+            self._server.flush()
 
     def _look_through(self, clients: list[Any]) -> None:
         reconstruction = self._run.reconstruction
