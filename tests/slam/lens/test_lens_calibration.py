@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from uni4d_fg.config.camera import CameraConfig
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
@@ -26,7 +27,7 @@ from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental import IncrementalReconstructor
 from uni4d_fg.slam.incremental.model import FrameTracks
-from uni4d_fg.slam.lens.calibration import calibrate_lens
+from uni4d_fg.slam.lens.calibration import LensCandidate, calibrate_lens, is_taken
 from uni4d_fg.slam.lens.tracks import ideal_tracks
 
 pytest.importorskip("open3d")
@@ -170,3 +171,23 @@ def test_a_small_distortion_needs_held_out_tracks() -> None:
     assert found.candidates[0].evidence > settings.camera.min_evidence
     assert found.candidates[0].held_out_gain < 0.0
     assert found.lens == PINHOLE
+
+
+@pytest.mark.parametrize(
+    ("evidence", "displacement_px", "held_out_gain", "taken"),
+    [
+        (0.02, 20.0, 0.05, True),
+        (0.02, 20.0, -0.03, True),  # a large one of the right kind
+        (0.02, 20.0, -1.8, False),  # a large one that the held-out tracks contradict
+        (0.001, 20.0, 0.05, False),
+        (0.02, 0.5, 0.05, False),
+        (0.02, 3.0, -0.03, False),
+        (0.02, 3.0, 0.01, True),
+        (0.02, np.inf, 0.05, False),
+    ],
+)
+def test_a_lens_needs_energy_distance_and_held_out_tracks(
+    evidence: float, displacement_px: float, held_out_gain: float, taken: bool
+) -> None:
+    candidate = LensCandidate(Lens("SIMPLE_RADIAL", (0.1,)), np.ones(4), evidence, held_out_gain, displacement_px)
+    assert is_taken(candidate, CameraConfig(), (480, 640)) is taken

@@ -19,6 +19,7 @@ from typing import cast
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, evenly_spread
+from uni4d_fg.config.camera import CameraConfig
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
@@ -134,17 +135,29 @@ def calibrate_lens(
             found = replace(found, evidence=evidence)
         candidate = _candidate(found, judge.gain(found, best), image_size)
         candidates.append(candidate)
-        if candidate.evidence < settings.min_evidence:
-            break
-        if not settings.min_displacement_px < candidate.displacement_px < np.inf:
-            break
-        is_small = candidate.displacement_px < settings.sure_displacement * max(image_size)
-        if is_small and candidate.held_out_gain <= 0.0:
+        if not is_taken(candidate, settings, image_size):
             break
         best = found
     if best is pinhole:
         return LensCalibration(Lens(), intrinsics, candidates, fit.solves, zoom=zoom)
     return LensCalibration(best.lens, best.intrinsics, candidates, fit.solves, zoom=zoom)
+
+
+def is_taken(candidate: LensCandidate, settings: CameraConfig, image_size: tuple[int, int]) -> bool:
+    """Tell whether the images ask for a lens: energy, distance and held-out tracks must all speak for it.
+
+    Args:
+        candidate: The lens and what it gains over the simpler one.
+        settings: Limits.
+        image_size: (height, width), px.
+    """
+    if candidate.evidence < settings.min_evidence:
+        return False
+    if not settings.min_displacement_px < candidate.displacement_px < np.inf:
+        return False
+    if candidate.displacement_px < settings.sure_displacement * max(image_size):
+        return candidate.held_out_gain > 0.0
+    return candidate.held_out_gain >= -settings.max_held_out_loss
 
 
 def _as_model(lens: Lens, model: LensModel) -> Lens:
