@@ -178,9 +178,9 @@ def expected_shares(
 ) -> list[Share]:
     """Return the tasks of a reconstruction.
 
-    The costs are processor seconds of videos of 24 to 65 frames of 0.08 to 0.3 megapixels: a constant, and so much per
-    megapixel of the whole video. How many points there are is not known before, nor whether depth is matched between
-    frames, which makes fusion 0.5 to 6 s per megapixel: it is taken for one between.
+    The costs are seconds on two cores of videos of 24 to 60 frames of 0.08 to 0.3 megapixels: a constant, and so much
+    per megapixel of the whole video. How many points there are is not known before, nor whether a depth cue is so wrong
+    that depth is matched between frames, which makes fusion three times as long: it is taken for a good one.
 
     Args:
         num_frames: T.
@@ -190,7 +190,7 @@ def expected_shares(
         tracks: Those that the video brings.
     """
     size = num_frames * image_size[0] * image_size[1] / 1e6
-    tracking = 0.3 + 0.8 * size
+    tracking = 0.55 + 0.2 * size
     shares: list[Share] = []
 
     def add(task: str, constant: float, per_megapixel: float) -> None:
@@ -203,31 +203,31 @@ def expected_shares(
         if moved:
             _motion(add)
         if plan.masks == "motion":
-            add("motion of tracks", 3.0, 0.4)
+            add("motion of tracks", 1.3, 0.25)
             add("motion masks", 0.5, 0.6)
             add("masks to disk", 0.1, 0.02)
             if moved:
                 _motion(add)
     known = tracks is not None or not plan.is_given
     shares.append(Share("tracks", 0.05 + 0.02 * size if known else tracking))
-    add("lens", 0.55, 0.03)
-    add("camera init", 0.25, 0.0)
+    add("lens", 0.42, 0.016)
+    add("camera init", 0.15, 0.0)
     if tracks is None:
-        add("bundle adjustment", 0.5, 1.4)
+        add("bundle adjustment", 0.6, 0.16)
     else:
-        add("bundle adjustment", 0.05 + 2.2e-5 * float(np.count_nonzero(tracks.visible)), 0.0)
-    add("nonrigid", 0.2, 0.12)
+        add("bundle adjustment", 0.1 + 6e-6 * float(np.count_nonzero(tracks.visible)), 0.0)
+    add("nonrigid", 0.5, 0.03)
     if config.joint.enabled:
         add("joint", 0.5, 0.6)
-    add("fusion", 6.3 + 0.1 * num_frames, 0.95)
-    add("clouds and pictures", 3.0, 0.05)
+    add("fusion", (3.4 if moved else 1.6) + 0.01 * num_frames, 0.08)
+    add("clouds and pictures", 1.35, 0.035)
     return shares
 
 
 def _motion(add: Callable[[str, float, float], None]) -> None:
     """Add the tasks of depth from camera motion."""
-    add("starting views", 3.0, 0.1)
-    add("structure from motion", 1.0, 0.1)
-    add("focal lengths", 3.0, 0.15)
-    add("depth of moving things", 0.1, 0.2)
-    add("depth maps", 0.1, 0.3)
+    add("starting views", 2.4, 0.1)
+    add("structure from motion", 0.7, 0.1)
+    add("focal lengths", 2.6, 0.15)
+    add("depth of moving things", 1.0, 0.2)
+    add("depth maps", 0.8, 0.3)
