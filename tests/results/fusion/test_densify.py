@@ -71,14 +71,3 @@ def test_missing_depth_stays_missing_and_only_there(rng: np.random.Generator) ->
     control = control_points(rng, truth, mask, log_scale)
     fused = densify_frame(cue, mask, INTRINSICS, control, 0.04, 0.1, FusionConfig())
     np.testing.assert_array_equal(np.isnan(fused), np.isnan(cue))
-
-
-def test_moving_things_alone_have_the_same_depth(rng: np.random.Generator) -> None:
-    truth, mask, log_scale = scene(rng)
-    mask[5:12, 140:160] = 1
-    cue = (truth * np.exp(-log_scale)).astype(np.float32)
-    control = control_points(rng, truth, mask, log_scale, count=4000, noise=0.01)
-    whole = densify_frame(cue, mask, INTRINSICS, control, 0.04, 0.1, FusionConfig())
-    moving = densify_frame(cue, mask, INTRINSICS, control, 0.04, 0.1, FusionConfig(), moving_only=True)
-    np.testing.assert_array_equal(moving[mask > 0], whole[mask > 0])
-    np.testing.assert_allclose(moving[mask == 0], cue[mask == 0] * np.exp(0.04), rtol=1e-6)

@@ -48,8 +48,6 @@ def densify_frame(
     frame_log_scale: float,
     depth_sigma: float,
     config: FusionConfig,
-    *,
-    moving_only: bool = False,
 ) -> Float32Array:
     """Correct one frame's depth cue.
 
@@ -61,7 +59,6 @@ def densify_frame(
         frame_log_scale: The frame's own log-scale: used where an instance has too few control points.
         depth_sigma: Standard deviation of the cue's log depth, from the static scene.
         config: Fusion.
-        moving_only: Leave static pixels with nothing but the frame's log-scale.
 
     Returns:
         (H, W) float32 m, NaN exactly where the cue is missing.
@@ -73,8 +70,7 @@ def densify_frame(
     nodes = _grid(depth, intrinsics, config.stride)
     limit = config.max_scale_sigmas * depth_sigma
     plausible = np.isfinite(control.log_scale) & (np.abs(control.log_scale - frame_log_scale) <= limit)
-    labels = np.unique(mask[mask > 0] if moving_only else mask)
-    for label in labels.tolist():
+    for label in np.unique(mask).tolist():
         mine = np.flatnonzero(plausible & (control.instance == label))
         if len(mine) < config.min_control_points:
             continue
