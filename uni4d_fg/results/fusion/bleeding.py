@@ -37,8 +37,7 @@ def bleeding_radius(log_cue: Float32Array, log_depth: Float32Array, sure: BoolAr
     Returns:
         Working px, 0 if it does not bleed; NaN if the frame has no edges that tell.
     """
-    window = np.ones((3, 3), np.uint8)
-    edge = (cv2.dilate(log_depth, window) - cv2.erode(log_depth, window) > _EDGE) & sure
+    edge = (log_range(log_depth, np.ones((3, 3), np.uint8)) > _EDGE) & sure
     if not edge.any():
         return float("nan")
     distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 3)

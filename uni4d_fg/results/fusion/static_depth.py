@@ -13,6 +13,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.bleeding import across_edges, from_nearest
 from uni4d_fg.results.fusion.cue_error import CorrectedCue, KnownDepth, correct_cue
+from uni4d_fg.results.fusion.log_range import log_range
 from uni4d_fg.results.fusion.multiview.measured import Measured
 from uni4d_fg.results.fusion.wide_window import blurred
 
@@ -284,7 +285,7 @@ def _beside_edges(measured: Measured) -> BoolArray:
 
 
 def _changes(log_depth: Float32Array) -> BoolArray:
-    return np.asarray(cv2.dilate(log_depth, _BLUR_WINDOW) - cv2.erode(log_depth, _BLUR_WINDOW) > _EDGE)
+    return np.asarray(log_range(log_depth, _BLUR_WINDOW) > _EDGE)
 
 
 def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tuple[Float32Array, Float32Array]:
