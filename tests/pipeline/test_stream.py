@@ -17,7 +17,7 @@ from stream_samples import stream as stream_of
 from typer.testing import CliRunner
 
 from uni4d_fg.cli.main import application
-from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.errors import Cancelled, InputError, OutputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.write import write_native
 from uni4d_fg.frontend.trajectory_files import read_tum
@@ -120,6 +120,13 @@ def test_a_checkpoint_of_another_configuration_is_refused(tmp_path: Path) -> Non
     (tmp_path / "stages" / "stream.npz").write_bytes(b"PK")
     with pytest.raises(InputError, match=r"stream\.npz"):
         stream_sequence(stream(FRAMES), tmp_path, CONFIG, resume=True)
+
+
+@pytest.mark.parametrize("name", ["trajectory.tum", "stages/stream.npz"])
+def test_a_folder_in_the_place_of_an_earlier_result_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir(parents=True)
+    with pytest.raises(OutputError, match=f"cannot write .*{name}"):
+        stream_sequence(stream(3), tmp_path, CONFIG)
 
 
 def test_the_verb(tmp_path: Path) -> None:

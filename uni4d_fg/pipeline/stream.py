@@ -13,7 +13,7 @@ import numpy as np
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
-from uni4d_fg.files import atomic_write_json, atomic_write_text
+from uni4d_fg.files import atomic_write_json, atomic_write_text, remove_file
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.pipeline.assemble import write_result
@@ -136,8 +136,8 @@ def _stream(
     resumed = folder.resume(solver, key, should_stop) if resume else False
     remove_leftovers(RunFolder(run_dir))
     if not resumed:
-        RunFolder(run_dir).trajectory.unlink(missing_ok=True)
-        folder.checkpoint.unlink(missing_ok=True)
+        remove_file(RunFolder(run_dir).trajectory)
+        remove_file(folder.checkpoint)
     atomic_write_text(RunFolder(run_dir).config, dump_config(config))
     first, began = solver.num_frames, time.perf_counter()
     counts: dict[str, int] = {}

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import load_npz, save_npz, write_failure
+from uni4d_fg.files import load_npz, remove_file, save_npz, write_failure
 from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry.se3 import orthonormalize
 from uni4d_fg.geometry.trajectory import Trajectory
@@ -138,4 +138,4 @@ class StreamFolder:
             poses = orthonormalize(np.stack([f.world_T_cam for f in frames]))
             write_tum(path, Trajectory(np.array([f.timestamp for f in frames]), poses))
         else:
-            path.unlink(missing_ok=True)
+            remove_file(path)
