@@ -160,7 +160,8 @@ def _stream(
             seconds["checkpoint"] = seconds.get("checkpoint", 0.0) + time.perf_counter() - since
     folder.save(solver, key)
     solver.flush()
-    path, closing = close_stream(folder, solver.intrinsics, sequence, config)
+    finished = folder.read()
+    path, closing = close_stream(finished, solver.intrinsics, sequence, config)
     reconstruction = solver.collect(path)
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began
@@ -171,7 +172,7 @@ def _stream(
     if closing is not None:
         seconds["loops"], facts = closing.seconds, closing.facts()
         doubts += closing.warnings()
-    bridged = sum(frame.status is FrameStatus.BRIDGED for frame in folder.frames())
+    bridged = sum(frame.status is FrameStatus.BRIDGED for frame in finished.frames())
     summary = StreamSummary(
         sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), doubts, bridged, facts
     )

@@ -7,7 +7,7 @@ trajectory is appended line by line as frames leave the window, for whoever watc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from uni4d_fg.reading import is_present
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FinishedFrame, Landmarks
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor
+from uni4d_fg.slam.incremental.results import ResultsInMemory
 
 
 class StreamFolder:
@@ -97,20 +98,26 @@ class StreamFolder:
         """Write what is left as a last part."""
         self._write_part()
 
-    def frames(self) -> Iterator[FinishedFrame]:
+    def frames(self) -> list[FinishedFrame]:
         """Read all finished frames in order."""
-        for number in range(self.num_parts):
-            yield from results_of(self._load(number))[0]
-        yield from self._frames
+        return self.read().frames()
 
-    def landmarks(self) -> Iterator[Landmarks]:
+    def landmarks(self) -> list[Landmarks]:
         """Read all finished landmarks."""
-        for number in range(self.num_parts):
-            yield results_of(self._load(number))[1]
-        yield from self._landmarks
+        return self.read().landmarks()
 
-    def _load(self, number: int) -> dict[str, np.ndarray]:
-        return load_npz(self.part(number), {"frames_frame": None})
+    def read(self) -> ResultsInMemory:
+        """Read all finished frames, in order, and landmarks: every file once.
+
+        Raises:
+            InputError: If a part is missing or damaged.
+        """
+        whole = ResultsInMemory()
+        for number in range(self.num_parts):
+            frames, landmarks = results_of(load_npz(self.part(number), {"frames_frame": None}))
+            whole.add(tuple(frames), (landmarks,))
+        whole.add(tuple(self._frames), tuple(self._landmarks))
+        return whole
 
     def _write_part(self) -> None:
         if self._frames or self._landmarks:
@@ -133,7 +140,7 @@ class StreamFolder:
             raise write_failure(path, error) from error
 
     def _rewrite_trajectory(self) -> None:
-        path, frames = RunFolder(self.root).trajectory, list(self.frames())
+        path, frames = RunFolder(self.root).trajectory, self.frames()
         if frames:
             poses = orthonormalize(np.stack([f.world_T_cam for f in frames]))
             write_tum(path, Trajectory(np.array([f.timestamp for f in frames]), poses))
