@@ -18,7 +18,8 @@ Fagan and Chin 1973, "Formation of a sparse bus impedance matrix", for the inver
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -135,6 +136,16 @@ class FrontChain:
             x[front.own] = _solve(front.factors, x[front.own]) - front.coupling @ x[front.after]
         return x.T
 
+    def real(self) -> FrontChain:
+        """Return the chain of the matrix's real part, where the imaginary part is a complex step.
+
+        The factors of a sum A + i t B have those of A as their real parts, up to the square of t.
+        """
+        chain = copy(self)
+        chain.fronts = [replace(f, factors=_real(f.factors), coupling=f.coupling.real) for f in self.fronts]
+        chain._border_factors = _real(self._border_factors)
+        return chain
+
     def inverse_blocks(self) -> tuple[NumberArray, NumberArray]:
         """Return the inverse's blocks of every frame (T, per_frame, per_frame) and of the border (b, b).
 
@@ -166,13 +177,11 @@ class FrontChain:
         frames[frame[i], column[i], column[j]] = matrix[i, j]
 
 
-def sandwich_blocks(
+def stepped_chain(
     windows: list[Window], outer: list[FloatArray], inner: list[FloatArray], free: BoolArray, per_frame: int,
     shared: int, entries: Sequence[Entries] = (),
-) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:  # fmt: skip
-    """Return the blocks of A^{-1}, and of A^{-1} B A^{-1}, for sums A and B over windows.
-
-    The second is minus the derivative of (A + t B)^{-1} at t = 0, which a complex step gives to the last digits.
+) -> FrontChain:  # fmt: skip
+    """Return the factorization of a sum A, with a complex step in the direction of another, B.
 
     Args:
         windows: As for :class:`FrontChain`.
@@ -183,15 +192,23 @@ def sandwich_blocks(
         shared: Columns of the border that windows tie.
         entries: Of both A and B besides.
 
-    Returns:
-        Each as by :meth:`FrontChain.inverse_blocks`.
-
     Raises:
         SolverError: If A is singular.
     """
     matrices = [a + 1j * _STEP * b for a, b in zip(outer, inner, strict=True)]
     stepped = [(rows, columns, (1.0 + 1j * _STEP) * values) for rows, columns, values in entries]
-    frames, border = FrontChain(windows, matrices, free, per_frame, shared, stepped).inverse_blocks()
+    return FrontChain(windows, matrices, free, per_frame, shared, stepped)
+
+
+def sandwich_blocks(chain: FrontChain) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Return the blocks of A^{-1}, and of A^{-1} B A^{-1}, each as by :meth:`FrontChain.inverse_blocks`.
+
+    The second is minus the derivative of (A + t B)^{-1} at t = 0, which a complex step gives to the last digits.
+
+    Args:
+        chain: As by :func:`stepped_chain`.
+    """
+    frames, border = chain.inverse_blocks()
     return (frames.real, border.real), (-frames.imag / _STEP, -border.imag / _STEP)
 
 
@@ -215,6 +232,11 @@ def _factorize(matrix: NumberArray) -> tuple[NumberArray, NumberArray]:
             "joining windows: the windows do not determine every camera; use longer windows or a wider overlap"
         )
     return lu, pivots
+
+
+def _real(factors: tuple[NumberArray, NumberArray]) -> tuple[NumberArray, NumberArray]:
+    lu, pivots = factors
+    return np.ascontiguousarray(lu.real), pivots
 
 
 def _solve(factors: tuple[NumberArray, NumberArray], sides: NumberArray) -> NumberArray:

@@ -15,7 +15,7 @@ from uni4d_fg.optim.cluster_robust import MIN_CLUSTERS
 from uni4d_fg.optim.few_clusters import blend
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.added_terms import AddedTerms
-from uni4d_fg.slam.windows.fronts import FrontChain, sandwich_blocks
+from uni4d_fg.slam.windows.fronts import sandwich_blocks, stepped_chain
 from uni4d_fg.slam.windows.information import FRAME, SHARED, WindowInformation
 
 
@@ -49,13 +49,11 @@ def joined_covariances(
     rests[0][-4:, -4:] += known
 
     windows, entries = [part.window for part in information], [] if added is None else added.linearize(cameras)[1]
-    model, rest = (
-        _Marginals(frames[:, :6, :6], border[:SHARED, :SHARED])
-        for frames, border in sandwich_blocks(windows, curvatures, rests, free, FRAME, SHARED, entries)
-    )
+    chain = stepped_chain(windows, curvatures, rests, free, FRAME, SHARED, entries)
+    model, rest = (_Marginals(frames[:, :6, :6], border[:SHARED, :SHARED]) for frames, border in sandwich_blocks(chain))
     if scores is None:
         return model.poses, model.intrinsics
-    influence = FrontChain(windows, curvatures, free, FRAME, SHARED, entries).solve(scores)
+    influence = chain.real().solve(scores)
     twists = influence[:, : FRAME * num_frames].reshape(len(scores), num_frames, FRAME)[:, :, :6]
     of_intrinsics = influence[:, FRAME * num_frames :][:, :SHARED]
     clusters = _Marginals(np.einsum("mti,mtj->tij", twists, twists, optimize=True), of_intrinsics.T @ of_intrinsics)
