@@ -56,7 +56,8 @@ def test_a_stage_comes_back_as_it_was(solved: StageGraph, tmp_path: Path) -> Non
 
 
 def test_the_values_are_gtsams_own(solved: StageGraph, tmp_path: Path) -> None:
-    solved.write_values(tmp_path)
+    for name, text in solved.values_text().items():
+        (tmp_path / name).write_text(text)
     values = gtsam.Values()
     values.deserialize((tmp_path / "bundle_adjustment.final.values").read_text())
     state: State = solved.final_state

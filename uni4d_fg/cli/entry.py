@@ -7,6 +7,8 @@ import signal
 import sys
 from types import FrameType
 
+from uni4d_fg.allocation import keep_freed_memory
+
 
 def _end(number: int, frame: FrameType | None) -> None:
     """End the process at once: an exception would get lost in the libraries that are being loaded."""
@@ -24,6 +26,7 @@ def main() -> None:
         with_escapes = getattr(getattr(sys, name), "reconfigure", None)
         if with_escapes is not None:
             with_escapes(errors="backslashreplace")
+    keep_freed_memory()
     from uni4d_fg.cli.main import main as run
 
     run()

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 
 import gtsam
 
 from uni4d_fg.factors.state import State
-from uni4d_fg.files import atomic_write_text
 from uni4d_fg.optim.gtsam_graph import to_gtsam, variables_read
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
@@ -44,14 +42,10 @@ class StageGraph:
         """Values after the solve."""
         return self.final_state.to_values(variables_read(self.problem, self.final_state))
 
-    def write_values(self, folder: Path) -> None:
-        """Write ``KIND.initial.values`` and ``KIND.final.values``: text that ``gtsam.Values().deserialize`` reads.
-
-        Raises:
-            OutputError: If a file cannot be written.
-        """
-        for name, values in (("initial", self.initial), ("final", self.final)):
-            atomic_write_text(folder / f"{self.kind}.{name}.values", values.serialize())
+    def values_text(self) -> dict[str, str]:
+        """Return files that ``gtsam.Values().deserialize`` reads: ``KIND.initial.values``, ``KIND.final.values``."""
+        ends = (("initial", self.initial), ("final", self.final))
+        return {f"{self.kind}.{name}.values": values.serialize() for name, values in ends}
 
 
 @dataclass

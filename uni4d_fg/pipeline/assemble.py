@@ -18,12 +18,12 @@ from uni4d_fg.geometry.trajectory import Trajectory
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.pipeline.leftovers import remove_views
 from uni4d_fg.pipeline.steps import Arrays
+from uni4d_fg.results import pictures as drawn
 from uni4d_fg.results.clouds import write_clouds
 from uni4d_fg.results.confidence_store import read_confidence
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.fusion.clouds import dynamic_cloud, dynamic_clouds, static_cloud
 from uni4d_fg.results.io import save_reconstruction
-from uni4d_fg.results.pictures import draw_depth_strip, draw_scene, draw_trajectory
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.results.track_colors import track_colors
 from uni4d_fg.slam.reconstruction import OBJECT_ARRAYS, Reconstruction
@@ -108,11 +108,11 @@ def write_views(
         write_clouds(folder, static, _until(should_stop, moving))
 
     def pictures() -> None:
-        draw_trajectory(folder.trajectory_picture, poses, sequence.ground_truth.world_T_cam, unit=unit)
+        drawn.draw_trajectory(folder.trajectory_picture, poses, sequence.ground_truth.world_T_cam, unit=unit)
         _check(should_stop)
-        draw_depth_strip(folder.depth_picture, sequence.images, sequence.depths, depth, unit=unit)
+        drawn.draw_depth_strip(folder.depth_picture, sequence.images, sequence.depths, depth, unit=unit)
         _check(should_stop)
-        draw_scene(folder.scene_picture, reconstruction, static, dynamic)
+        drawn.draw_scene(folder.scene_picture, reconstruction, static, dynamic)
 
     def dynamic(frame: int) -> tuple[np.ndarray, ImageArray]:
         return dynamic_cloud(

@@ -11,7 +11,8 @@ import numpy as np
 
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.frame_checks import checked_image, checked_mask, floating_depth
-from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
+from uni4d_fg.optim.threads import map_in_order, thread_count
 
 _Check = Callable[[Any, tuple[int, int], str], np.ndarray]
 _CHECKS: dict[str, _Check] = {"image": checked_image, "depth": floating_depth, "mask": checked_mask}
@@ -21,21 +22,28 @@ ALGORITHM_VERSION = 3
 
 
 def sequence_key(sequence: Sequence, should_stop: Callable[[], bool] | None = None) -> str:
-    """Hash every image, depth map and mask, the calibration, poses and tracks (frame by frame).
+    """Hash every image, depth map and mask, the calibration, poses and tracks; frames one at a time.
 
     Raises:
         Cancelled: If ``should_stop`` said so.
         InputError: If a frame cannot be read or has another size than the sequence.
     """
-    digest = hashlib.blake2b(digest_size=16)
-    for frame in range(sequence.num_frames):
-        if should_stop is not None and should_stop():
-            raise Cancelled("stopped while reading the sequence")
-        for name, source in (("image", sequence.images), ("depth", sequence.depths), ("mask", sequence.masks)):
+
+    def hashed(named: tuple[str, FrameSource[Any]]) -> bytes:
+        name, source = named
+        own = hashlib.blake2b(digest_size=16)
+        for frame in range(sequence.num_frames):
+            if should_stop is not None and should_stop():
+                raise Cancelled("stopped while reading the sequence")
             array = source[frame]
             # Sources of the caller's own may hold anything; what comes after relies on shapes and types.
             _CHECKS[name](array, sequence.image_size, f"sequence {sequence.name}: {name} of frame {frame}")
-            _update(digest, array)
+            _update(own, array)
+        return own.digest()
+
+    # Side by side, but each in order and by one thread: a video is decoded forwards.
+    sources = [("image", sequence.images), ("depth", sequence.depths), ("mask", sequence.masks)]
+    digest = hashlib.blake2b(b"".join(map_in_order(hashed, sources, thread_count())), digest_size=16)
     _update(digest, sequence.intrinsics)
     if not sequence.lens.is_pinhole:
         digest.update(sequence.lens.model.encode())

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from uni4d_fg.files import remove_file
+from dataclasses import dataclass
+
+from uni4d_fg.files import atomic_write_text, remove_file
 from uni4d_fg.optim.problem_io import load_stage_graph
 from uni4d_fg.results.run_folder import RunFolder
 
@@ -35,17 +37,36 @@ def remove_graphs(folder: RunFolder, step: str) -> None:
             remove_file(path)
 
 
-def write_graph_values(folder: RunFolder) -> dict[str, dict[str, int]]:
-    """Write the values of every stored graph as GTSAM's text; return how large the graphs are, by kind.
+@dataclass(frozen=True)
+class GraphValues:
+    """The values of a run's graphs as GTSAM's text."""
 
-    Raises:
-        InputError: If a stored graph cannot be read.
-        OutputError: If a file cannot be written.
-    """
-    sizes = {}
-    for path in sorted(folder.graphs.glob("*.graph.npz")) if folder.graphs.is_dir() else ():
-        stage = load_stage_graph(path)
-        stage.write_values(folder.graphs)
-        factors = sum(len(batch) for batch in stage.problem.batches)
-        sizes[stage.kind] = {"factors": factors, "variables": int(stage.final.size())}
-    return sizes
+    text: dict[str, str]
+    """By file name."""
+    sizes: dict[str, dict[str, int]]
+    """How large the graphs are, by kind."""
+
+    @classmethod
+    def of(cls, folder: RunFolder) -> GraphValues:
+        """Read every graph that a run has stored.
+
+        Raises:
+            InputError: If one cannot be read.
+        """
+        text: dict[str, str] = {}
+        sizes = {}
+        for path in sorted(folder.graphs.glob("*.graph.npz")) if folder.graphs.is_dir() else ():
+            stage = load_stage_graph(path)
+            text |= stage.values_text()
+            factors = sum(len(batch) for batch in stage.problem.batches)
+            sizes[stage.kind] = {"factors": factors, "variables": int(stage.final.size())}
+        return cls(text, sizes)
+
+    def write(self, folder: RunFolder) -> None:
+        """Write the files beside the graphs.
+
+        Raises:
+            OutputError: If one cannot be written.
+        """
+        for name, text in self.text.items():
+            atomic_write_text(folder.graphs / name, text)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Thread
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,7 +39,7 @@ from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
-from uni4d_fg.pipeline.graphs import kinds_of, remove_graphs, write_graph_values
+from uni4d_fg.pipeline.graphs import GraphValues, kinds_of, remove_graphs
 from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
@@ -52,6 +54,7 @@ from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, WindowWorkers, wind
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.results import pictures
 from uni4d_fg.results.confidence_store import read_confidence
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.labels_io import load_labels, save_labels
@@ -239,6 +242,8 @@ def _reconstruct(
 def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: StageRunner) -> RunSummary:
     """Do all steps of a run that has been prepared."""
     sequence, config, folder, summary = run.sequence, run.config, run.folder, run.summary
+    if config.output.pictures:
+        Thread(target=pictures.load).start()
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
     key = sequence_key(sequence, run.should_stop)
@@ -279,10 +284,14 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
     unit = "m" if summary.cues.get("metric", True) else "scale unknown"
-    write_views(folder, sequence, reconstruction, config, run.should_stop, unit=unit)
-    graphs = write_graph_values(folder)
+    with ThreadPoolExecutor(1) as beside:
+        # Clouds mostly wait for the disk.
+        made = beside.submit(GraphValues.of, folder)
+        write_views(folder, sequence, reconstruction, config, run.should_stop, unit=unit)
+    graphs = made.result()
+    graphs.write(folder)
     run.reporter.end()
-    run._note("output", {"graphs": graphs}, time.perf_counter() - began, False)
+    run._note("output", {"graphs": graphs.sizes}, time.perf_counter() - began, False)
     atomic_write_json(folder.summary, summary.to_dict())
     return summary
 

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from uni4d_fg.allocation import SETTINGS
 from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.optional import import_distributed
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -49,7 +50,8 @@ def open_workers(options: WorkerOptions, count: int, folder: Path, module: str |
 def _local(distributed: Any, options: WorkerOptions, count: int, module: str | None) -> Iterator[Any]:
     import dask
 
-    variables = {**dict.fromkeys(_THREAD_VARIABLES, options.threads), **_MEMORY_VARIABLES}
+    # Dask's own trim threshold of 64 KiB has every large array mapped anew: a third of a run's time.
+    variables = {**dict.fromkeys(_THREAD_VARIABLES, options.threads), **SETTINGS}
     environment = {f"distributed.nanny.pre-spawn-environ.{name}": str(value) for name, value in variables.items()}
     changed = {
         # Retries are counted by who gives the tasks out: the scheduler says at once that a worker died.
@@ -71,9 +73,6 @@ def _local(distributed: Any, options: WorkerOptions, count: int, module: str | N
 
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-_MEMORY_VARIABLES = {"MALLOC_TRIM_THRESHOLD_": 64 << 20, "MALLOC_MMAP_THRESHOLD_": 32 << 20}
-"""What glibc's allocator ends at by itself, bytes. Dask's own trim threshold of 64 KiB keeps it from that: every large
-array is then mapped anew, three million page faults in a run that has forty thousand, a third of its time."""
 
 
 def _connect(distributed: Any, address: str) -> Any:
