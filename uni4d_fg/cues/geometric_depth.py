@@ -23,6 +23,7 @@ from uni4d_fg.cues.interpolated_depth import (
     smooth_over_time,
     supported,
 )
+from uni4d_fg.cues.moving_things import Sightings, place_moving
 from uni4d_fg.cues.start_doubts import start_doubts, start_summary
 from uni4d_fg.cues.structure.motion import Structure, rotations_only, structure_from_motion
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
@@ -155,7 +156,9 @@ def _with_maps(
     known = np.isfinite(inverse)
     sparse[observations.track[known], observations.frame[known]] = 1.0 / inverse[known]
     frames = _points_per_frame(observations, inverse, video.num_frames, settings)
-    depths = _stand(InterpolatedDepths(frames, video.image_size, settings), video, reporter, should_stop)
+    depths, said, doubts = _place(
+        InterpolatedDepths(frames, video.image_size, settings), video, tracks, structure, reporter, should_stop
+    )
     triangulated = int(np.isfinite(structure.points.position[:, 0]).sum())
     fx, fy = structure.intrinsics[:2]
     facts = (
@@ -166,8 +169,9 @@ def _with_maps(
         f"scale by convention: median depth of the first frame is {settings.median_depth:g}",
         f"focal length between {structure.focal.low:.0f} and {structure.focal.high:.0f} px (95 %); the cameras explain "
         f"{100 * (1.0 - structure.unexplained):.0f} % of what was held out",
+        *said,
     )
-    warnings = tuple(start_doubts(structure, video.image_size, settings))
+    warnings = (*start_doubts(structure, video.image_size, settings), *doubts)
     start = start_summary(structure)
     return GeometricDepth(depths, structure.world_T_cam, structure.intrinsics, sparse, True, facts, warnings, start)
 
@@ -234,22 +238,36 @@ def _points_per_frame(
     return tuple(found[int(usable[np.argmin(np.abs(usable - frame))])] for frame in range(num_frames))
 
 
-def _stand(
-    depths: InterpolatedDepths, video: Video, reporter: Reporter, should_stop: Callable[[], bool]
-) -> InterpolatedDepths:
-    """Stand what the masks mark on the static scene."""
+def _place(
+    depths: InterpolatedDepths, video: Video, tracks: Tracks, structure: Structure, reporter: Reporter,
+    should_stop: Callable[[], bool],
+) -> tuple[InterpolatedDepths, list[str], list[str]]:  # fmt: skip
+    """Put what the masks mark where it stands, or where its motion shows it to be nearer; return facts and warnings."""
     if video.masks is None:
-        return depths
+        return depths, [], []
     standing = []
+    sightings = Sightings(tracks)
     reporter.begin("depth of moving things", video.num_frames)
     for frame in range(video.num_frames):
         if should_stop():
             raise Cancelled("depth from motion stopped")
-        standing.append(ground_contact(video.masks[frame], depths.points[frame], depths.config))
+        mask = video.masks[frame]
+        standing.append(ground_contact(mask, depths.points[frame], depths.config))
+        sightings.add(frame, mask)
         reporter.advance(frame + 1)
     reporter.end()
-    smoothed = smooth_over_time(standing, depths.config.contact_smoothing)
-    return replace(depths, masks=video.masks, standing=smoothed)
+    contacts = smooth_over_time(standing, depths.config.contact_smoothing)
+    placed = place_moving(contacts, sightings, structure.world_T_cam, structure.intrinsics)
+    facts = [
+        f"moving thing {label} is {ratio:.1f} times nearer than what is seen below it, as the camera's shake tells"
+        for label, ratio in placed.nearer.items()
+    ]
+    warnings = [
+        f"the depth of moving thing {label} is a guess: the image cuts it off below, and the camera's motion does not "
+        "show how far it is. Give depth maps or a depth network for it"
+        for label in placed.open
+    ]
+    return replace(depths, masks=video.masks, standing=placed.inverse_depth), facts, warnings
 
 
 def _without_parallax(

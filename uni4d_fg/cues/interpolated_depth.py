@@ -2,8 +2,8 @@
 
 Inverse depth is linear in the image over any plane, so it is what is interpolated: linearly over the Delaunay
 triangles of the static points in the frame, and taken from the nearest point outside their hull. A moving
-thing has no static points of its own. It is given one depth, that of the static surface at the lowest part
-of its mask, where it touches the ground.
+thing has no static points of its own. It is given one depth per frame: that of the static surface at the lowest part
+of its mask, where it may touch the ground, or a smaller one (``moving_things.py``).
 """
 
 from __future__ import annotations

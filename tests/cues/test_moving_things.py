@@ -1,0 +1,145 @@
+"""Depth of moving things from one camera: its shake, apparent sizes, and where things stand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.cues.moving_parallax import moving_parallax, regress
+from uni4d_fg.cues.moving_things import Sightings, place_moving, weigh
+from uni4d_fg.frontend.track_model import Tracks
+
+FRAMES, FOCAL, SIZE = 40, 400.0, (240, 320)
+INTRINSICS = np.array([FOCAL, FOCAL, 160.0, 120.0])
+TIME = np.arange(FRAMES) / 15.0
+
+
+def camera(tremor_m: float) -> FloatArray:
+    """A camera that goes sideways, (T, 3), with a hand's tremor at 2.3 Hz."""
+    phase = np.array([0.0, 2.1, 4.4])
+    return TIME[:, None] * [0.3, 0.05, 0.0] + tremor_m * np.sin(2 * np.pi * 2.3 * TIME[:, None] + phase)
+
+
+def thing(speed_z: float = 0.0) -> FloatArray:
+    """The middle (T, 3) of a thing 2 m away that swings at 0.25 Hz."""
+    swing = 0.3 * np.sin(2 * np.pi * 0.25 * TIME)
+    return np.stack([swing, 0.4 * swing**2, 2.0 + speed_z * TIME], axis=1)
+
+
+def poses(centers: FloatArray) -> FloatArray:
+    out = np.tile(np.eye(4), (FRAMES, 1, 1))
+    out[:, :3, 3] = centers
+    return out
+
+
+def seen(middle: FloatArray, centers: FloatArray, noise_px: float, seed: int = 0) -> Tracks:
+    """60 points of a thing of 0.4 m as tracks."""
+    rng = np.random.default_rng(seed)
+    points = middle + rng.uniform(-0.2, 0.2, (60, 1, 3)) * [1, 1, 0]
+    x = points - centers
+    uv = FOCAL * x[..., :2] / x[..., 2:] + INTRINSICS[2:] + rng.normal(0, noise_px, (60, FRAMES, 2))
+    return Tracks(uv.astype(np.float32), np.ones((60, FRAMES), dtype=bool), np.zeros(60, dtype=np.int32))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_cameras_shake_shows_how_far_a_moving_thing_is(seed: int) -> None:
+    centers = camera(0.006)
+    tracks = seen(thing(), centers, 0.1, seed)
+    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS)
+    assert found.first == 0
+    assert found.size.shape == (FRAMES,)
+    assert found.inverse_depth == pytest.approx(0.5, rel=0.1)
+    assert found.sigma < 0.05
+
+
+def test_a_camera_that_moves_evenly_shows_nothing_of_it() -> None:
+    centers = camera(0.0)
+    tracks = seen(thing(), centers, 0.1)
+    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS)
+    assert found.sigma > 10 * abs(0.5)
+
+
+def test_errors_of_the_image_do_not_bias_the_regression() -> None:
+    estimates = [
+        regress(-0.5 * camera(0.006)[:, :2] + np.random.default_rng(seed).normal(0, 3e-3, (FRAMES, 2)),
+                camera(0.006)[:, :2])[0]
+        for seed in range(200)
+    ]  # fmt: skip
+    assert np.mean(estimates) == pytest.approx(0.5, abs=4 * np.std(estimates) / np.sqrt(200))
+
+
+def test_the_apparent_size_follows_a_thing_that_comes_near() -> None:
+    centers, middle = camera(0.006), thing(speed_z=-0.3)
+    tracks = seen(middle, centers, 0.1)
+    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS)
+    z = (middle - centers)[:, 2]
+    at_one = found.size * z
+    assert at_one.std() / at_one.mean() < 0.01
+    assert found.inverse_depth == pytest.approx(1 / at_one.mean(), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "sigma", "cut", "stands", "factor"),
+    [
+        (0.0, np.inf, False, True, 1.0),
+        (1.05, 0.1, False, True, 1.04),
+        (2.5, 0.15, False, False, 2.5),
+        (10.0, 4.0, False, True, 1.0),  # nearly nothing
+        (-30.0, 10.0, False, True, 1.0),  # not a motion that the model has
+        (0.4, 0.1, False, True, 1.0),  # nothing is behind what it hides
+        (2.5, 0.15, True, False, 2.5),
+        (0.0, np.inf, True, False, 1.8),
+    ],
+)
+def test_standing_and_being_nearer_are_weighed(
+    ratio: float, sigma: float, cut: bool, stands: bool, factor: float
+) -> None:
+    found, log_ratio = weigh(ratio, sigma, cut)
+    assert found == stands
+    assert np.exp(log_ratio) == pytest.approx(factor, rel=0.1, abs=0.01)
+
+
+def sightings(tracks: Tracks, rows: slice) -> Sightings:
+    """A mask that holds all tracks but for its rows."""
+    out = Sightings(tracks)
+    mask = np.zeros(SIZE, dtype=np.int32)
+    mask[rows] = 3
+    for frame in range(FRAMES):
+        out.add(frame, mask)
+    return out
+
+
+def test_a_thing_that_floats_is_put_nearer_than_what_is_below_it() -> None:
+    centers = camera(0.006)
+    middle = thing(speed_z=-0.2)
+    tracks = seen(middle, centers, 0.1)
+    contacts = tuple({3: 0.2} for _ in range(FRAMES))
+    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), poses(centers), INTRINSICS)
+    z = 1 / np.array([values[3] for values in placed.inverse_depth])
+    np.testing.assert_allclose(z, (middle - centers)[:, 2], rtol=0.12)
+    assert placed.nearer[3] == pytest.approx(2.7, rel=0.1)
+    assert not placed.open
+
+
+def test_without_shake_it_stays_where_it_may_stand_and_a_thing_that_is_cut_off_is_named() -> None:
+    centers = camera(0.0)
+    tracks = seen(thing(), centers, 0.1)
+    contacts = tuple({3: 0.2} for _ in range(FRAMES))
+    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), poses(centers), INTRINSICS)
+    np.testing.assert_allclose([values[3] for values in placed.inverse_depth], 0.2, rtol=1e-3)
+    assert not placed.nearer
+    assert not placed.open
+    cut = place_moving(contacts, sightings(tracks, slice(0, 240)), poses(centers), INTRINSICS)
+    assert cut.open == [3]
+
+
+def test_things_without_tracks_and_frames_without_things_are_left_alone() -> None:
+    nothing = Tracks(np.zeros((0, 3, 2), np.float32), np.zeros((0, 3), dtype=bool), np.zeros(0, dtype=np.int32))
+    found = Sightings(nothing)
+    for frame in range(3):
+        mask = np.zeros(SIZE, dtype=np.int32)
+        mask[50:60] = 2 * (frame > 0)
+        found.add(frame, mask)
+    placed = place_moving(({}, {2: 0.3}, {2: 0.4}), found, np.tile(np.eye(4), (3, 1, 1)), INTRINSICS)
+    assert placed.inverse_depth == ({}, {2: 0.3}, {2: 0.4})

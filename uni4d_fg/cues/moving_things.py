@@ -1,0 +1,145 @@
+"""Where moving things are that one camera has seen: standing on what is below them, or nearer.
+
+What moves hides what is behind it, so that it is no farther than the static surface at the lowest part of its mask.
+Most things stand there. Those that do not (they fly, they are carried, or the image cuts them off) are nearer, by a
+factor that only the camera's own motion may show (``moving_parallax.py``). Both are weighed by what it shows:
+
+- standing: ``log rho ~ N(0, 0.15^2)``, where ``rho`` is the inverse depth over that of the surface below;
+- nearer: ``log rho`` exponential, 0.7 in the mean, and at most ``log 8``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from uni4d_fg.cues.moving_parallax import Parallax, moving_parallax
+from uni4d_fg.frontend.track_model import Tracks
+
+_STANDING_SIGMA = 0.15
+_STANDS, _STANDS_CUT = 0.7, 0.1
+"""Probability that a thing stands where its mask ends, and where the image's lower border cuts it off."""
+_NEARER_MEAN = 0.7
+_NEAREST = 8.0
+_LOG_RATIO = np.arange(-0.6, np.log(_NEAREST), 0.01)
+_TOO_SURE = 1.3
+"""Standard deviations of the parallax are this much too small, on synthetic scenes ..."""
+_SHARED = 0.08
+"""... and cameras that are not exact bias it by up to this part."""
+_MODEL_WRONG = 0.1
+"""Probability that a thing is not as smooth as it is taken to be: parallax then shows any ratio up to the nearest."""
+_ON_IT = 0.5
+"""A track is on a thing if it is inside its mask in this part of its frames."""
+_MIN_TRACKS = 8
+
+
+@dataclass
+class Sightings:
+    """Collects, frame by frame, which tracks are on which thing and where things are cut off."""
+
+    tracks: Tracks
+    inside: dict[int, IntArray] = field(default_factory=dict)
+    """By id: (K,) frames in which a track is inside the mask."""
+    cut: dict[int, list[bool]] = field(default_factory=dict)
+    """By id: whether the image's lower border cuts it off, in each frame that has it."""
+
+    def add(self, frame: int, mask: Int32Array) -> None:
+        """Add the mask (H, W) of a frame."""
+        labels = np.unique(mask[mask > 0])
+        if not len(labels):
+            return
+        seen = np.flatnonzero(self.tracks.visible[:, frame])
+        height, width = mask.shape
+        column, row = np.rint(self.tracks.uv[seen, frame]).astype(np.int64).T
+        at = mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        for label in labels.tolist():
+            inside = self.inside.setdefault(label, np.zeros(self.tracks.num_tracks, np.int64))
+            inside[seen[at == label]] += 1
+            self.cut.setdefault(label, []).append(bool((mask[-1] == label).any()))
+
+    def on(self, label: int) -> BoolArray:
+        """Return which tracks (K,) are on a thing."""
+        total = np.count_nonzero(self.tracks.visible, axis=1)
+        return np.asarray(self.inside[label] > _ON_IT * np.maximum(total, 1))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Inverse depth of moving things, and which of them do not stand."""
+
+    inverse_depth: tuple[dict[int, float], ...]
+    """T: by id."""
+    nearer: dict[int, float]
+    """By id: over the inverse depth of the surface below, for things that do not stand on it."""
+    open: list[int]
+    """Things that are cut off by the image and whose depth nothing shows."""
+
+
+def place_moving(
+    contacts: tuple[Mapping[int, float], ...], sightings: Sightings, world_T_cam: FloatArray, intrinsics: FloatArray
+) -> Placed:
+    """Decide where things are.
+
+    Args:
+        contacts: T: inverse depth of the static surface at the lowest part of each thing, by id.
+        sightings: Of all frames.
+        world_T_cam: (T, 4, 4).
+        intrinsics: (4,) px.
+    """
+    placed = [dict(contact) for contact in contacts]
+    nearer: dict[int, list[float]] = {}
+    unknown = []
+    tracks = sightings.tracks
+    for label in sorted(sightings.inside):
+        mine = sightings.on(label)
+        cut = float(np.mean(sightings.cut[label])) > _ON_IT
+        stretches = list[Parallax]()
+        if np.count_nonzero(mine) >= _MIN_TRACKS:
+            uv = tracks.uv[mine].astype(np.float64)
+            stretches = moving_parallax(uv, tracks.visible[mine], world_T_cam, intrinsics)
+        shown = False
+        for parallax in stretches:
+            frames = [
+                frame for frame in range(parallax.first, parallax.first + len(parallax.size))
+                if label in contacts[frame]
+            ]  # fmt: skip
+            if not frames:
+                continue
+            size = parallax.size[np.array(frames) - parallax.first]
+            standing = float(np.median([contacts[frame][label] for frame in frames] / size))
+            stands, log_ratio = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut)
+            shown |= parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
+            for frame, here in zip(frames, size.tolist(), strict=True):
+                placed[frame][label] = np.exp(log_ratio) * (contacts[frame][label] if stands else standing * here)
+            if not stands:
+                nearer.setdefault(label, []).append(float(np.exp(log_ratio)))
+        if cut and not shown:
+            unknown.append(label)
+    return Placed(tuple(placed), {label: float(np.median(ratios)) for label, ratios in nearer.items()}, unknown)
+
+
+def weigh(ratio: float, sigma: float, cut: bool) -> tuple[bool, float]:
+    """Return whether a thing stands, and the mean of ``log rho`` if so.
+
+    Args:
+        ratio: Inverse depth from parallax over that of the surface below.
+        sigma: Its standard deviation; infinite if nothing is known.
+        cut: The image cuts the thing off below.
+    """
+    share = _STANDS_CUT if cut else _STANDS
+    standing = np.exp(-0.5 * (_LOG_RATIO / _STANDING_SIGMA) ** 2)
+    nearer = np.where(_LOG_RATIO >= 0, np.exp(-_LOG_RATIO / _NEARER_MEAN), 0.0)
+    standing, nearer = share * standing / standing.sum(), (1 - share) * nearer / nearer.sum()
+    likelihood, wrong = np.ones_like(_LOG_RATIO), 0.0
+    if np.isfinite(sigma):
+        total = np.hypot(_TOO_SURE * sigma, _SHARED * ratio)
+        likelihood = np.exp(-0.5 * ((np.exp(_LOG_RATIO) - ratio) / total) ** 2)
+        wrong = _MODEL_WRONG / (1 - _MODEL_WRONG) * np.sqrt(2 * np.pi) * total / _NEAREST
+    weights = [hypothesis * (likelihood + wrong) for hypothesis in (standing, nearer)]
+    stands = bool(weights[0].sum() >= weights[1].sum())
+    chosen = weights[0] if stands else weights[1]
+    # Nothing is behind what it hides: that it seems so comes from errors of the cameras, which make it too far.
+    return stands, max(float(_LOG_RATIO @ chosen / chosen.sum()), 0.0)
