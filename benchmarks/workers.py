@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from uni4d_fg.allocation import keep_freed_memory
 from uni4d_fg.config.load import load_config
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.open_video import open_video
@@ -50,6 +51,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--root", type=Path, help="folder of the scenes, kept; else a temporary one")
     asked = parser.parse_args()
+    keep_freed_memory()  # as the command line does
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         frames = asked.frames or (1000 if asked.what == "windows" else 24)

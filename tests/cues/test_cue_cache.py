@@ -31,7 +31,7 @@ def test_a_flipped_bit_in_a_map_is_noticed_and_the_map_made_again(tmp_path: Path
     maps = [rng.random(SIZE, np.float32) for _ in range(3)]
 
     def stored() -> FloatMaps:
-        return store_maps(iter(maps), 3, SIZE, tmp_path, "maps", SilentReporter(), lambda: False)
+        return store_maps(ArrayFrames(np.stack(maps)), SIZE, tmp_path, "maps", SilentReporter(), lambda: False)
 
     first = stored()
     whole = first.paths[1].read_bytes()

@@ -61,7 +61,7 @@ def geometric_depth(
     names = [f"{frame:06d}" for frame in range(video.num_frames)]
     if stored is None or not all(cache.has_map(name, video.image_size) for name in names):
         result = depth_from_motion(video, tracks, is_static, intrinsics, config, reporter, should_stop)
-        store_maps(iter(result.depths), video.num_frames, video.image_size, target, "depth maps", reporter, should_stop)
+        store_maps(result.depths, video.image_size, target, "depth maps", reporter, should_stop)
         said = json.dumps([list(result.facts), list(result.warnings), result.start])
         # Written last: with it, the maps are complete.
         cache.put_arrays(
@@ -173,9 +173,8 @@ def aligned_depth(
     named = [path.name for path in disparity.paths]
     key = maker_key(disparity.paths[0].parent.name, named, _digest(fit.scale, fit.shift), config.affine_depth)
     maps = store_maps(
-        iter(fit.depths), len(named), disparity.size, folder / "depth" / f"aligned-{key}", "depth maps", reporter,
-        should_stop,
-    )  # fmt: skip
+        fit.depths, disparity.size, folder / "depth" / f"aligned-{key}", "depth maps", reporter, should_stop
+    )
     fact = (
         f"relative depth aligned to {int(np.median(fit.points))} points per frame (median), "
         f"noise {100 * fit.sigma:.1f} % of inverse depth"

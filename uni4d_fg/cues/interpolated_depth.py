@@ -87,13 +87,16 @@ def interpolate(points: SparseInverseDepth, image_size: tuple[int, int], stride:
 
 def evaluate(points: SparseInverseDepth, uv: FloatArray) -> FloatArray:
     """Return the interpolated inverse depth at pixels (M, 2), (M,)."""
-    out: FloatArray = np.asarray(NearestNDInterpolator(points.uv, points.inverse_depth)(uv), dtype=np.float64)
+    result: FloatArray = np.full(len(uv), np.nan)
     try:
         triangles = Delaunay(points.uv)
     except (QhullError, ValueError):  # fewer than three points, or all on one line
-        return out
-    inside = np.asarray(LinearNDInterpolator(triangles, points.inverse_depth)(uv))
-    result: FloatArray = np.where(np.isfinite(inside), inside, out)
+        pass
+    else:
+        result = np.asarray(LinearNDInterpolator(triangles, points.inverse_depth)(uv), dtype=np.float64)
+    outside = ~np.isfinite(result)
+    if outside.any():
+        result[outside] = NearestNDInterpolator(points.uv, points.inverse_depth)(uv[outside])
     return result
 
 

@@ -21,9 +21,10 @@ from uni4d_fg.cues.point_tracker_network import PointTrackerNetwork
 from uni4d_fg.cues.segmentation_network import SegmentationNetwork
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.frames import MaskFolder
-from uni4d_fg.frontend.sequence.model import Video
+from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
+from uni4d_fg.optim.threads import thread_count, workers_in_order
 from uni4d_fg.progress import Reporter
 
 ShouldStop = Callable[[], bool]
@@ -210,24 +211,28 @@ def _label_paths(folder: Path, count: int) -> tuple[Path, ...]:
 
 
 def store_maps(
-    maps: Iterator[Float32Array], count: int, size: tuple[int, int], folder: Path, task: str, reporter: Reporter,
+    maps: FrameSource[Float32Array], size: tuple[int, int], folder: Path, task: str, reporter: Reporter,
     should_stop: ShouldStop,
 ) -> FloatMaps:  # fmt: skip
-    """Write maps one by one, unless all are there, and open them.
+    """Make and write maps (H, W) on all threads, unless all are there, and open them.
 
     Raises:
         OutputError: If one cannot be written.
         Cancelled: If ``should_stop`` said so.
     """
-    cache = FrameCache(folder)
+    cache, count = FrameCache(folder), len(maps)
     names = [f"{frame:06d}" for frame in range(count)]
+
+    def store(frame: int) -> None:
+        _check(should_stop, f"{frame} of {count} frames are done")
+        cache.put_map(names[frame], maps[frame])
+
     if not all(cache.has_map(name, size) for name in names):
         reporter.begin(task, count)
         rate = Rate(count, time.monotonic)
-        for frame, values in enumerate(maps):
-            _check(should_stop, f"{frame} of {count} frames are done")
-            cache.put_map(names[frame], values)
-            reporter.advance(frame + 1, rate.text(frame + 1, True))
+        with workers_in_order(thread_count()) as mapped:
+            for done, _ in enumerate(mapped(store, list(range(count))), start=1):
+                reporter.advance(done, rate.text(done, True))
         reporter.end()
     return FloatMaps(tuple(cache.map_path(name) for name in names), size)
 

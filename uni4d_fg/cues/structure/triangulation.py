@@ -165,9 +165,7 @@ def _refine(rays: RayBundle, position: FloatArray, huber_px: float) -> tuple[Flo
         jacobian = chain_to_world_point(by_x, poses)
         residual = rays.uv[used] - project(rays.intrinsics, x)
         weight = 1.0 / np.maximum(np.linalg.norm(residual, axis=1) / huber_px, 1.0)
-        weighted = jacobian * weight[:, None, None]
-        hessian = _sum_rows(np.swapaxes(weighted, 1, 2) @ jacobian, row, len(tracks))
-        gradient = _sum_rows((residual[:, None] @ weighted)[:, 0], row, len(tracks))
+        hessian, gradient = _normal_equations(jacobian, residual, weight, row, len(tracks))
         step = np.linalg.solve(_padded(hessian), gradient[..., None])[..., 0]
         # A step longer than the distance to the cameras leads nowhere.
         nearest = np.full(len(tracks), np.inf)
@@ -178,6 +176,23 @@ def _refine(rays: RayBundle, position: FloatArray, huber_px: float) -> tuple[Flo
         information[tracks] = hessian
         moving[tracks[length < _CONVERGED * nearest]] = False
     return position, information
+
+
+def _normal_equations(
+    jacobian: FloatArray, residual: FloatArray, weight: FloatArray, row: IntArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return J'WJ (count, 3, 3) and J'Wr (count, 3), summed over the observations of each row.
+
+    Written out by columns: products of many tiny matrices cost numpy several times their arithmetic.
+    """
+    hessian, gradient = np.empty((count, 3, 3)), np.empty((count, 3))
+    u, v = np.ascontiguousarray(jacobian.transpose(1, 2, 0))
+    for a in range(3):
+        weighted_u, weighted_v = weight * u[a], weight * v[a]
+        gradient[:, a] = np.bincount(row, weighted_u * residual[:, 0] + weighted_v * residual[:, 1], count)
+        for b in range(a + 1):
+            hessian[:, a, b] = hessian[:, b, a] = np.bincount(row, weighted_u * u[b] + weighted_v * v[b], count)
+    return hessian, gradient
 
 
 def _padded(information: FloatArray) -> FloatArray:
