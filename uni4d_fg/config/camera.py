@@ -33,6 +33,7 @@ class CameraConfig(Section):
     )
     min_zoom: float = setting(0.05, "Part by which the focal length must vary to be taken for a zoom.", gt=0, lt=1)
     observations: int = setting(20000, "Observations that the lens is found from, at most.", ge=1000)
+    zoom_observations: int = setting(60000, "Observations that a zoom is refined on, at most.", ge=1000)
     frames: int = setting(60, "Frames that the lens is found from, at most.", ge=3)
     hold_out_every: int = setting(5, "Every so many tracks, one is held out to judge the models.", ge=2)
     starts: tuple[float, ...] = setting((-0.3, -0.15, 0.15), "Distortions k1 from which the search starts.")
@@ -45,6 +46,12 @@ class CameraConfig(Section):
     probe_steps: int = setting(2, "Undamped steps from which the evidence for distortion is read.", ge=1)
     min_evidence: float = setting(
         0.003, "Part of the reprojection energy that free distortion must take away to be taken.", ge=0, lt=1
+    )
+    min_further_evidence: float = setting(
+        0.001,
+        "Part of what one radial parameter leaves of that energy that a second one must take away to be taken.",
+        ge=0,
+        lt=1,
     )
     min_displacement_px: float = setting(1.0, "Distance by which it must move some pixel of the image, px.", ge=0)
     sure_displacement: float = setting(

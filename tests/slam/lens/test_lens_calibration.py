@@ -40,10 +40,8 @@ def config(*changes: str) -> Config:
 
 
 def scene(lens: Lens, **more: object) -> Sequence:
-    made = SyntheticSceneConfig(
-        num_frames=20, render_images=False, camera_model=lens.model, distortion=lens.parameters, **more
-    )
-    return make_synthetic_sequence(made)
+    plain = {"num_frames": 20, "render_images": False, "camera_model": lens.model, "distortion": lens.parameters}
+    return make_synthetic_sequence(SyntheticSceneConfig(**(plain | more)))
 
 
 def labelled(sequence: Sequence) -> LabelledTracks:
@@ -191,3 +189,42 @@ def test_a_lens_needs_energy_distance_and_held_out_tracks(
 ) -> None:
     candidate = LensCandidate(Lens("SIMPLE_RADIAL", (0.1,)), np.ones(4), evidence, held_out_gain, displacement_px)
     assert is_taken(candidate, CameraConfig(), (480, 640)) is taken
+
+
+@pytest.mark.parametrize(
+    ("evidence", "held_out_gain", "taken"), [(0.0012, 0.0005, True), (0.0005, 0.0005, False), (0.005, -0.001, False)]
+)
+def test_a_second_parameter_needs_less_energy_and_held_out_tracks(
+    evidence: float, held_out_gain: float, taken: bool
+) -> None:
+    candidate = LensCandidate(Lens("RADIAL", (-0.25, 0.1)), np.ones(4), evidence, held_out_gain, 25.0)
+    assert is_taken(candidate, CameraConfig(), (480, 640), after_another=True) is taken
+
+
+@pytest.mark.parametrize("lens", [Lens("SIMPLE_RADIAL", (-0.12,)), Lens("RADIAL", (-0.25, 0.1))])
+def test_one_or_two_parameters_as_the_lens_has_them(lens: Lens) -> None:
+    """A lens of one parameter alone errs by 0.7 % in the tangents of its directions where two are needed."""
+    sequence = scene(lens, num_frames=30, grid_columns=29, grid_rows=23)
+    truth = sequence.ground_truth.intrinsics
+    assert truth is not None
+    found = calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config())
+    assert found.lens.model == lens.model
+    border = np.array([[x, 119.5] for x in np.linspace(169.5, 359.5, 20)])  # to the distance of the corners
+
+    def tangents(of: Lens, intrinsics: np.ndarray) -> np.ndarray:
+        return (of.ideal_pixels(intrinsics, border)[:, 0] - intrinsics[2]) / intrinsics[0]
+
+    ratio = tangents(found.lens, found.intrinsics) / tangents(lens, truth)
+    assert ratio.max() / ratio.min() < 1.006
+
+
+def test_a_lens_is_no_zoom() -> None:
+    """A camera that moves along its view through a lens: a focal length per frame explains much of the distortion."""
+    lens = Lens("RADIAL", (-0.25, 0.1))
+    sequence = scene(lens, num_frames=60, camera_speed=0.8, grid_columns=20, grid_rows=15, seed=6)
+    found = calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config())
+    assert found.zoom is not None
+    assert found.zoom.evidence > config().camera.min_zoom_evidence
+    assert found.zoom.zoom is None
+    assert found.lens.model == "RADIAL"
+    assert found.intrinsics[0] == pytest.approx(300.0, rel=0.01)

@@ -4,7 +4,9 @@ Part of the tracks and frames serve. The test compares nested models: by which p
 energy fall when the distortion is set free at the pinhole's minimum? A plain likelihood ratio says yes too soon, as a
 tracker errs alike along a track and between neighbors; such errors do not reach a fixed part of the energy. Held-out
 tracks decide on small distortions only, which errors of a tracker may mimic: free poses bend so far that a wrong lens
-explains them nearly as well, and a large one that is right may explain them worse.
+explains them nearly as well, and a large one that is right may explain them worse. The second radial parameter needs
+less energy than the first, and a gain on held-out tracks whatever it moves: what a lens of one parameter leaves over
+is small, and where nothing is left over the second takes away a fifth of what it must at most.
 
 Focal length and distortion trade against each other along a narrow valley, in which a pinhole ends far from the truth
 (its focal length 30 % off where k1 is -0.12). The search therefore starts from several distortions, each undone before
@@ -105,7 +107,11 @@ def calibrate_lens(
     if not (labelled.weight[_static(labelled)] > 0).any():
         raise DegenerateProblemError("the lens: there is no static track")
     frames = calibration_frames(TrackSpans.of(labelled), count, settings.frames, config.windows.calibration_sightings)
-    some = tracks_in(_thinned(labelled, settings.observations * count // len(frames)), frames).labelled
+
+    def chosen(observations: int) -> LabelledTracks:
+        return tracks_in(_thinned(labelled, observations * count // len(frames)), frames).labelled
+
+    some = chosen(settings.observations)
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0
     config = settings_of_fit(config, consecutive=len(frames) == int(frames[-1]) + 1)
     fit = LensFit(config, some.without(held_out), intrinsics, run, hooks)
@@ -116,7 +122,10 @@ def calibrate_lens(
         return LensCalibration(found.lens, found.intrinsics, [_candidate(found, 0.0, image_size)], fit.solves)
 
     pinhole = FittedLens(Lens(), fit.scene(Lens(), intrinsics))
-    zoom = None if settings.zoom == "off" else find_zoom(ZoomFit(fit, frames), pinhole.scene, count, settings)
+    zoom = None
+    if settings.zoom != "off":
+        zooming = ZoomFit(fit, frames, chosen(settings.zoom_observations))
+        zoom = find_zoom(zooming, pinhole.scene, count, settings)
     if settings.model == "pinhole" or (zoom is not None and zoom.zoom is not None):
         # A lens beside a zoom is not sought.
         known = intrinsics if zoom is None or zoom.zoom is None else zoom.intrinsics
@@ -134,8 +143,9 @@ def calibrate_lens(
         if not candidates:
             found = replace(found, evidence=evidence)
         candidate = _candidate(found, judge.gain(found, best), image_size)
+        taken = is_taken(candidate, settings, image_size, after_another=bool(candidates))
         candidates.append(candidate)
-        if not is_taken(candidate, settings, image_size):
+        if not taken:
             break
         best = found
     if best is pinhole:
@@ -143,19 +153,22 @@ def calibrate_lens(
     return LensCalibration(best.lens, best.intrinsics, candidates, fit.solves, zoom=zoom)
 
 
-def is_taken(candidate: LensCandidate, settings: CameraConfig, image_size: tuple[int, int]) -> bool:
+def is_taken(
+    candidate: LensCandidate, settings: CameraConfig, image_size: tuple[int, int], *, after_another: bool = False
+) -> bool:
     """Tell whether the images ask for a lens: energy, distance and held-out tracks must all speak for it.
 
     Args:
         candidate: The lens and what it gains over the simpler one.
         settings: Limits.
         image_size: (height, width), px.
+        after_another: Whether the simpler one is a lens, too, and not the pinhole.
     """
-    if candidate.evidence < settings.min_evidence:
+    if candidate.evidence < (settings.min_further_evidence if after_another else settings.min_evidence):
         return False
     if not settings.min_displacement_px < candidate.displacement_px < np.inf:
         return False
-    if candidate.displacement_px < settings.sure_displacement * max(image_size):
+    if after_another or candidate.displacement_px < settings.sure_displacement * max(image_size):
         return candidate.held_out_gain > 0.0
     return candidate.held_out_gain >= -settings.max_held_out_loss
 

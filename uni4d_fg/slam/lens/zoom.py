@@ -2,7 +2,8 @@
 
 At the minimum of a camera that does not zoom, a few undamped steps with a focal length per frame tell by which part the
 reprojection energy would fall; the errors of a tracker reach no fixed part of it, as with the lens. Only where they do,
-everything is solved to the end. A zoom moves all pixels alike, motion along the view moves near ones more: the two are
+everything is solved to the end. A lens with distortion asks for a zoom, too, where the camera moves along its view, but
+for itself more. A zoom moves all pixels alike, motion along the view moves near ones more: the two are
 told apart by the relief of the scene and by its depth. The covariance of the solve says how well.
 """
 
@@ -56,6 +57,13 @@ def find_zoom(work: ZoomFit, scene: StaticScene, num_frames: int, config: Camera
     moved = float(np.ptp(probe.zoom))
     if config.zoom == "auto" and (probe.evidence < config.min_zoom_evidence or moved < _PROBED * config.min_zoom):
         note = f"a focal length per frame would lower the reprojection energy by {100 * probe.evidence:.2f} %"
+        return ZoomCalibration(None, scene.cameras.intrinsics, probe.evidence, _spread(probe), (note,), warnings)
+    distortion = work.fit.probe(scene) if config.zoom == "auto" and config.model == "auto" else 0.0
+    if distortion > probe.evidence:
+        note = (
+            f"a focal length per frame would lower the reprojection energy by {100 * probe.evidence:.2f} %, "
+            f"distortion by {100 * distortion:.2f} %"
+        )
         return ZoomCalibration(None, scene.cameras.intrinsics, probe.evidence, _spread(probe), (note,), warnings)
     found = work.solve(scene)
     for _ in range(1, config.rounds):

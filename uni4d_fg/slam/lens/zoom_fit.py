@@ -12,6 +12,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE, ZOOM
 from uni4d_fg.factors.zoom import zoom_smoothness, zoomed_reprojection
+from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.problem import Problem
@@ -46,6 +47,8 @@ class ZoomFit:
     fit: LensFit
     frames: np.ndarray
     """(F,) frames of the video that the tracks are of, ascending."""
+    more_tracks: LabelledTracks
+    """What a zoom that was found is refined on: more tracks of the same frames, on real pixels."""
 
     def probe(self, scene: StaticScene) -> FittedZoom:
         """Set the zoom free at the minimum of a camera that does not zoom, for a few undamped steps."""
@@ -55,15 +58,17 @@ class ZoomFit:
     def refine(self, start: FittedZoom) -> FittedZoom:
         """Undo a zoom, run stages 1 and 2 again, and find what is left of it.
 
-        The first solve begins at cameras that moved where they should have zoomed, and may end short of the minimum.
+        The first solve begins at cameras that moved where they should have zoomed, and may end short of the minimum. A
+        zoom is known no better than its tracks are many, and errors of 0.1 % in it cost the path as much as all others
+        do.
 
         Raises:
             DegenerateProblemError: If the cues do not determine the cameras.
             SolverError: If a system is singular or a cue is not finite.
         """
-        tracks = unzoomed_tracks(self.fit.tracks, start.intrinsics, start.zoom)
-        work = ZoomFit(replace(self.fit, tracks=tracks), self.frames)
-        left = work.solve(work.fit.scene(PINHOLE, start.intrinsics))
+        tracks = unzoomed_tracks(self.more_tracks, start.intrinsics, start.zoom)
+        fit = replace(self.fit, tracks=tracks)
+        left = replace(self, fit=fit).solve(fit.scene(PINHOLE, start.intrinsics))
         zoom, intrinsics = start.zoom + left.zoom, left.intrinsics.copy()
         longest = float(zoom.max())
         intrinsics[:2] *= np.exp(longest)
