@@ -17,7 +17,7 @@ from uni4d_fg.results.fusion.bleeding import bleeding_radius
 from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
 from uni4d_fg.results.fusion.lifting import lifted
-from uni4d_fg.results.fusion.mask_band import looks_moving
+from uni4d_fg.results.fusion.mask_band import looks_moving, stands_still
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import (
@@ -56,6 +56,7 @@ _SURE = 0.8
 """Matched depth of this confidence tells how far the cue bleeds."""
 _STILL = 0.6
 """Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
+_HALF = 0.5
 _BLED_SHARE = 2.0
 """Moving things take their depth from this many times as far inside as the cue bleeds in the mean."""
 _ADDS_NOTHING = "adds nothing to this cue, as landmarks say"
@@ -216,7 +217,9 @@ class DenseMaps:
         if moving.any():
             # Masks reach beyond what moves: what other frames see there just the same stands still.
             if frame in self.matched:
-                moving &= self.size.enlarge(mine.depth.matched) <= _STILL
+                static = without_band(mine.unmasked, self.config.multiview.mask_band_px)
+                still = stands_still(self.sequence.images[frame], mask, mine.depth.matched, static)
+                moving &= self.size.enlarge(still.astype(np.float32)) <= _HALF
             full[moving] = np.exp(self._moving(frame, given, mask)[moving])
         return full, FinalStatic(averaged.log_depth, sure, mine.unmasked)
 

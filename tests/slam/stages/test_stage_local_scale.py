@@ -38,6 +38,18 @@ def test_a_smooth_field_is_predicted_better_than_by_the_frame(rng: np.random.Gen
     assert np.sqrt(np.mean(error**2)) < 0.25 * np.sqrt(np.mean(frame_error**2))
 
 
+def test_what_is_far_from_the_static_scene_is_said_to_be_less_sure(rng: np.random.Generator) -> None:
+    static, queries = scattered(rng, 4 * PER_FRAME), scattered(rng, 4 * PER_FRAME)
+    center = np.array([160.0, 120.0])
+    static = static.select(np.linalg.norm(static.uv - center, axis=1) > 70)
+    queries = queries.select(np.linalg.norm(queries.uv - center, axis=1) < 65)
+    measured = FRAME_SCALE[static.frame] + smooth_field(static) + rng.normal(scale=0.004, size=len(static))
+    local = predict_log_scale(static, measured, FRAME_SCALE, queries, 24, 512)
+    error = local.log_scale - FRAME_SCALE[queries.frame] - smooth_field(queries)
+    assert local.is_local
+    assert 0.6 < local.sigma / np.sqrt(np.mean(error**2)) < 1.6
+
+
 def test_many_static_observations_are_measured_on_a_sample(rng: np.random.Generator) -> None:
     static, queries = scattered(rng, 4000), scattered(rng, 50)
     measured = FRAME_SCALE[static.frame] + smooth_field(static) + rng.normal(scale=0.01, size=len(static))

@@ -3,7 +3,8 @@ r"""The depth cue's scale where a moving object is, from the static scene around
 A cue errs by a frame-wide scale and, more weakly, by a field that is smooth over the image. The static
 landmarks measure both: s_i = log z_i - log D(uv_i). At a dynamic observation the scale is predicted by the
 median of the nearest static s_i in the image. Whether that is better than the frame's scale alone is not
-assumed but measured, by predicting static s_i from their neighbors without themselves.
+assumed but measured, by predicting static s_i from neighbors that are as far away as the static scene is from the
+moving points: a thing that covers much of the image is far from what it is compared with.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from uni4d_fg.optim.threads import thread_count
 from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 
+_DIRECTIONS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
 
 @dataclass(frozen=True)
 class LocalScale:
@@ -26,7 +29,7 @@ class LocalScale:
     log_scale: FloatArray
     """(N,) per queried observation."""
     sigma: float
-    """Standard deviation of the chosen prediction on the static scene."""
+    """Standard deviation of the chosen prediction on the static scene, from as far away as the queries are from it."""
     frame_sigma: float
     """The same for the frame's scale alone."""
 
@@ -70,11 +73,27 @@ def predict_log_scale(
         # Points spread over an image need no balanced tree, which takes longer to build.
         tree, values = cKDTree(static.uv[known], balanced_tree=False), deviation[known]
         sample = evenly_spread(len(known), samples)
-        _, near = tree.query(static.uv[known[sample]], k=neighbors + 1, workers=threads)
-        errors.append(values[sample] - np.median(values[near[:, 1:]], axis=1))
+        away = 0.0
         if len(mine):
-            _, near = tree.query(queries.uv[mine], k=neighbors, workers=threads)
-            predicted[mine] = np.median(values[near.reshape(len(mine), -1)], axis=1)
+            distance, near = (
+                found.reshape(len(mine), -1) for found in tree.query(queries.uv[mine], neighbors, workers=threads)
+            )
+            predicted[mine] = np.median(values[near], axis=1)
+            away = float(np.median(distance[:, 0]))
+        uv = static.uv[known]
+        for direction in _DIRECTIONS:
+            at = uv[sample] + away * direction
+            inside = np.flatnonzero(((at >= uv.min(axis=0)) & (at <= uv.max(axis=0))).all(axis=1))
+            if not len(inside):
+                continue
+            _, near = tree.query(at[inside], k=neighbors + 1, workers=threads)
+            # Without the point itself, or else without the one that is farthest.
+            own = near == sample[inside, None]
+            own[~own.any(axis=1), -1] = True
+            others = values[near[~own].reshape(len(inside), neighbors)]
+            errors.append(values[sample[inside]] - np.median(others, axis=1))
+            if away == 0.0:
+                break
     sigma = robust_sigma(np.concatenate(errors))
     if not sigma < frame_sigma:
         return whole_frame
