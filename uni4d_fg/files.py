@@ -195,6 +195,28 @@ def save_npy(path: Path, array: npt.ArrayLike, *, checksum: bool = False) -> Non
             write_checksums(stream, [zlib.crc32(np.ascontiguousarray(values).data)])
 
 
+@contextmanager
+def npy_stream(path: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[IO[bytes]]:
+    """Write the data of a ``.npy`` file piece by piece; it appears, whole, when the block ends normally.
+
+    Plain writes raise an error when the disk is full, where a memory map would end the process without a message.
+
+    Args:
+        path: The file.
+        dtype: As numpy describes it in a header: ``<f4``.
+        shape: Of the whole array, in C order.
+
+    Yields:
+        The file, behind its header.
+
+    Raises:
+        OutputError: If an ``OSError`` occurs in the block or while moving the file.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+        yield stream
+
+
 def write_checksums(stream: IO[bytes], checksums: Iterable[int]) -> None:
     """Write CRC-32 numbers of equal parts of the data of a ``.npy`` file (its rows, or all) behind the data."""
     numbers = np.array(list(checksums), dtype="<u4")

@@ -9,14 +9,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import cv2
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import atomic_path, load_npy
+from uni4d_fg.files import load_npy, npy_stream
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 
 _STEPS = 255
@@ -26,7 +26,7 @@ _STEPS = 255
 class ConfidenceWriter:
     """Takes the maps of a video, in order; made by :func:`write_confidence`."""
 
-    stream: BinaryIO
+    stream: IO[bytes]
     size: tuple[int, int]
     written: int = 0
 
@@ -51,12 +51,9 @@ def write_confidence(path: Path, num_frames: int, size: tuple[int, int]) -> Iter
         OutputError: If it cannot be written.
         ValueError: If a frame was not written.
     """
-    header = {"descr": "|u1", "fortran_order": False, "shape": (num_frames, *size)}
-    with atomic_path(path) as temporary:
-        with open(temporary, "wb") as stream:
-            np.lib.format.write_array_header_1_0(stream, header)
-            writer = ConfidenceWriter(stream, size)
-            yield writer
+    with npy_stream(path, "|u1", (num_frames, *size)) as stream:
+        writer = ConfidenceWriter(stream, size)
+        yield writer
         if writer.written != num_frames:
             raise ValueError(f"{path}: {writer.written} of {num_frames} frames were written")
 

@@ -1,7 +1,6 @@
 """The fused depth of a run: one ``.npy`` (T, H, W) of float32 meters, never held in memory as a whole.
 
-Frames are written with plain file writes and read back through a memory map. Writing through a memory map
-would end the process without a message when the disk is full; a plain write raises an error instead.
+Frames are written with plain file writes and read back through a memory map.
 """
 
 from __future__ import annotations
@@ -11,14 +10,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import atomic_path, load_checksums, load_npy, write_checksums
+from uni4d_fg.files import load_checksums, load_npy, npy_stream, write_checksums
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 
 
@@ -26,7 +25,7 @@ from uni4d_fg.frontend.sequence.model import ArrayFrames
 class DepthWriter:
     """Takes the depth maps of a video, in any order; made by :func:`write_depth`."""
 
-    stream: BinaryIO
+    stream: IO[bytes]
     start: int
     num_frames: int
     image_size: tuple[int, int]
@@ -64,18 +63,15 @@ def write_depth(path: Path, num_frames: int, image_size: tuple[int, int]) -> Ite
         OutputError: If it cannot be written.
         ValueError: If a frame was not written.
     """
-    header = {"descr": "<f4", "fortran_order": False, "shape": (num_frames, *image_size)}
-    with atomic_path(path) as temporary:
-        with open(temporary, "wb") as stream:
-            np.lib.format.write_array_header_1_0(stream, header)
-            writer = DepthWriter(stream, stream.tell(), num_frames, image_size)
-            yield writer
-            height, width = image_size
-            stream.seek(writer.start + 4 * num_frames * height * width)
-            write_checksums(stream, (writer.written.get(frame, 0) for frame in range(num_frames)))
-        if len(writer.written) != num_frames:
-            absent = min(set(range(num_frames)) - set(writer.written))
-            raise ValueError(f"{path}: depth of frame {absent} was not written")
+    with npy_stream(path, "<f4", (num_frames, *image_size)) as stream:
+        writer = DepthWriter(stream, stream.tell(), num_frames, image_size)
+        yield writer
+        absent = set(range(num_frames)) - set(writer.written)
+        if absent:
+            raise ValueError(f"{path}: depth of frame {min(absent)} was not written")
+        height, width = image_size
+        stream.seek(writer.start + 4 * num_frames * height * width)
+        write_checksums(stream, (writer.written[frame] for frame in range(num_frames)))
 
 
 @dataclass(frozen=True)
