@@ -277,6 +277,8 @@ def test_a_browser_shows_the_scene_and_follows_the_slider(finished_run: Path) ->
         largest = "[...document.querySelectorAll('canvas')].sort((a, b) => b.width - a.width)[0]"
         # Software draws it here: smooth edges would take most of its time.
         assert page.evaluate(f"{largest}.getContext('webgl2').getContextAttributes().antialias") is False
+        # viser's shader still has the words that make its points circles by three powers a pixel.
+        assert page.evaluate("window.uni4dDetail.circles") > 0
         box = page.get_by_role("textbox").locator("visible=true").first
         box.fill("6")
         box.press("Enter")

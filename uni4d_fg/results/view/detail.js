@@ -5,10 +5,15 @@
 // chunk is out of sight, and, while the picture changes, as much as the machine draws at the wanted rate; what is left
 // out is made up for by larger points. A picture that stands still gets several times as much, and more every time it is
 // drawn, up to what takes most of a second. Where a name that this relies on is not found, everything is drawn.
+//
+// Software draws a picture while the one before it is shown, so that what a key asks for waits for one or two of them:
+// it aims at a higher rate. Few large points cost it as much as many small ones, so that below the fewest points that
+// still show a scene, these get smaller.
 (() => {
   if (window.uni4dDetail || !window.WebGL2RenderingContext) return;
-  const TARGET_MS = 43, TOUCH_MS = 300, QUIET_MS = 800, STILL_FACTOR = 6, STILL_MOST = 20, FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24;
-  const state = (window.uni4dDetail = { budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false });
+  const TARGET_MS = 43, SOFTWARE_MS = 27, TOUCH_MS = 300, QUIET_MS = 800, STILL_FACTOR = 6, STILL_MOST = 20;
+  const FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24, SMALLEST_PX = 6;
+  const state = (window.uni4dDetail = { budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false, circles: 0 });
   // Without a graphics card, smoothing of edges costs more than everything else; points have none.
   let software = null;
   const getContext = HTMLCanvasElement.prototype.getContext;
@@ -25,6 +30,7 @@
   };
 
   const gl2 = WebGL2RenderingContext.prototype;
+  const target = () => (software ? SOFTWARE_MS : TARGET_MS);
   const NAMES = ["scale", "modelViewMatrix", "projectionMatrix"];
   const located = new WeakMap(), values = new WeakMap();
   let program = null, still = 0, asked = 0, shown = 0, moving = false, begun = false, before = 0, drewBefore = false;
@@ -40,6 +46,12 @@
       values.set(place, null);
     }
     return place;
+  });
+  // viser's points have any shape, by three powers a pixel, which is most of what software does; ours are circles.
+  wrap("shaderSource", (inner) => function (shader, text) {
+    const circle = text.replace(/float r = pow\([^;]*1\.0 \/ point_ball_norm\);/, "float r = length(gl_PointCoord - vec2(0.5));");
+    state.circles += circle !== text;
+    return inner.call(this, shader, circle);
   });
   const setNumber = wrap("uniform1f", (inner) => function (place, value) {
     if (place && values.has(place)) values.set(place, value);
@@ -74,13 +86,15 @@
     const part = worth(view, projection, scale);
     if (part === 0) return;
     asked += part * count;
-    const budget = moving ? state.budget : Math.min(STILL_FACTOR * 2 ** (still - 1), STILL_MOST) * state.budget;
+    const most = Math.max(state.budget, FEWEST), longer = TARGET_MS / target();
+    const budget = moving ? most : Math.min(STILL_FACTOR * 2 ** (still - 1), STILL_MOST) * longer * most;
     const fraction = part * Math.min(1, budget / Math.max(state.wanted, 1));
     const number = Math.max(1, Math.ceil(fraction * count));
     shown += number;
     if (number >= count) return inner.call(this, mode, first, count);
     const depth = Math.max(-view[14], 1e-6), size = scale / depth;
-    const larger = Math.max(size, Math.min(Math.max(size / Math.sqrt(number / count), 1), LARGEST_PX));
+    const largest = moving ? LARGEST_PX * Math.min(state.budget / FEWEST, 1) : LARGEST_PX;
+    const larger = Math.max(size, Math.min(Math.max(size / Math.sqrt(number / count), 1), largest));
     setNumber.call(this, places.scale, larger * depth);
     inner.call(this, mode, first, number);
     setNumber.call(this, places.scale, scale);
@@ -98,9 +112,9 @@
       asked = shown = 0;
       if (drewBefore && moving) {
         state.milliseconds += 0.3 * (Math.min(now - before, 500) - state.milliseconds);
-        const ratio = TARGET_MS / Math.max(state.milliseconds, 1);
+        const ratio = target() / Math.max(state.milliseconds, 1);
         if (ratio < 0.9 || ratio > 1.1) state.budget *= Math.min(Math.max(ratio, 0.7), 1.1);
-        state.budget = Math.min(Math.max(state.budget, FEWEST), MOST);
+        state.budget = Math.min(Math.max(state.budget, (FEWEST * SMALLEST_PX) / LARGEST_PX), MOST);
       }
     }
     begun = false;

@@ -1,0 +1,103 @@
+"""Level of detail in the page, on a clock and a renderer that are made up: the script sees calls and times only."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import Any
+
+import pytest
+from viewing_samples import browser_page
+
+pytest.importorskip("playwright")
+
+STAGE = """<!doctype html><title>stage</title><script>
+// A renderer that takes BASE ms for a picture, EACH for a point and FILL for a pixel of it, and a clock that it moves.
+let now = 1000, frames = [], scale = 0, spent = 0, sizes = [];
+const kind = location.hash.slice(1).split(","), [name, BASE, EACH, FILL] = [kind[0], ...kind.slice(1).map(Number)];
+performance.now = () => now;
+window.requestAnimationFrame = (go) => frames.push(go);
+const gl = WebGL2RenderingContext.prototype;
+gl.uniform1f = (place, value) => { scale = value; };
+gl.uniformMatrix4fv = gl.useProgram = () => {};
+gl.getUniformLocation = (owner, called) => ({ called });
+gl.getParameter = () => name;
+gl.drawArrays = (mode, first, count) => { sizes.push(scale / 5); spent += count * (EACH + FILL * (scale / 5) ** 2); };
+</script><script>SCRIPT</script><script>
+const context = document.createElement("canvas").getContext("webgl2", { antialias: true });
+const program = {}, place = (called) => context.getUniformLocation(program, called);
+const places = { scale: place("scale"), view: place("modelViewMatrix"), projection: place("projectionMatrix") };
+const view = new Float32Array([1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,-5,1]), projection = new Float32Array(16).fill(0);
+projection[0] = projection[5] = 1;
+const tick = () => { for (const go of frames.splice(0)) go(now); };
+// Draw a cloud of 1.6 million points of a pixel each, milliseconds after the picture before; return what was drawn.
+function picture(after = 0) {
+  if (after) { now += after; tick(); }
+  spent = BASE; sizes = [];
+  context.useProgram(program);
+  context.uniformMatrix4fv(places.view, false, view);
+  context.uniformMatrix4fv(places.projection, false, projection);
+  for (let chunk = 0; chunk < 32; chunk++) {
+    context.uniform1f(places.scale, 5);
+    context.drawArrays(context.POINTS, 0, 50000);
+  }
+  now += Math.max(spent, 16);
+  tick();
+  return { drawn: window.uni4dDetail.drawn, ms: Math.max(spent, 16), size: Math.max(...sizes) };
+}
+const turn = (count) => { let last; for (let k = 0; k < count; k++) last = picture(); return last; };
+</script>"""
+
+GPU = "NVIDIA,2,1e-6,1e-6"
+SOFTWARE = "SwiftShader,10,4e-4,5e-5"
+SLOW_SOFTWARE = "SwiftShader,14,1e-3,4e-5"
+ALL = 1_600_000
+
+
+def stage(page: Any, renderer: str) -> None:
+    script = (files("uni4d_fg.results.view") / "detail.js").read_text(encoding="utf-8")
+    page.route(
+        "http://stage/", lambda route: route.fulfill(body=STAGE.replace("SCRIPT", script), content_type="text/html")
+    )
+    page.goto(f"http://stage/#{renderer}")
+
+
+def test_a_graphics_card_draws_everything_all_the_time() -> None:
+    with browser_page() as page:
+        stage(page, GPU)
+        page.evaluate("turn(60)")
+        for _ in range(3):
+            assert page.evaluate("turn(20)")["drawn"] == pytest.approx(ALL)
+            assert page.evaluate("picture(1000)")["drawn"] == pytest.approx(ALL)
+
+
+def test_software_aims_at_pictures_that_a_key_does_not_wait_long_for() -> None:
+    with browser_page() as page:
+        stage(page, SOFTWARE)
+        page.evaluate("turn(60)")
+        moving = page.evaluate("turn(20)")
+        assert 22.0 < moving["ms"] < 32.0
+        assert moving["drawn"] >= 6000
+
+
+def test_where_the_fewest_points_take_too_long_they_are_smaller() -> None:
+    with browser_page() as page:
+        stage(page, SLOW_SOFTWARE)
+        page.evaluate("turn(80)")
+        moving = page.evaluate("turn(20)")
+        # Points that touch would be 16 px wide and take 14 + 6 + 61 ms.
+        assert moving["drawn"] == pytest.approx(6000, rel=0.02)
+        assert 5.9 <= moving["size"] < 9.0
+        assert moving["ms"] < 33.0
+
+
+def test_a_picture_that_stands_still_gets_more_and_one_after_a_key_less() -> None:
+    with browser_page() as page:
+        stage(page, SLOW_SOFTWARE)
+        moving = page.evaluate("turn(80)")
+        still = [page.evaluate("picture(1000)")["drawn"] for _ in range(4)]
+        assert still[0] > 6 * moving["drawn"]
+        assert still == sorted(still)
+        assert still[-1] == pytest.approx(still[-2])
+        page.evaluate("now += 900")
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate("picture(30)")["drawn"] == pytest.approx(moving["drawn"], rel=0.02)
