@@ -180,7 +180,8 @@ def expected_shares(
 
     The costs are seconds on two cores of videos of 24 to 60 frames of 0.08 to 0.3 megapixels: a constant, and so much
     per megapixel of the whole video. How many points there are is not known before, nor whether a depth cue is so wrong
-    that depth is matched between frames, which makes fusion three times as long: it is taken for a good one.
+    that depth is matched between frames, which makes fusion three to four times as long: a given one is taken
+    so that a whole run is off by about the same factor with a bad cue as with a good one.
 
     Args:
         num_frames: T.
@@ -219,7 +220,7 @@ def expected_shares(
     add("nonrigid", 0.5, 0.03)
     if config.joint.enabled:
         add("joint", 0.5, 0.6)
-    add("fusion", (3.4 if moved else 1.6) + 0.01 * num_frames, 0.08)
+    add("fusion", 3.4 + 0.01 * num_frames if moved else 2.1 + 0.013 * num_frames, 0.08 if moved else 0.105)
     add("clouds and pictures", 1.35, 0.035)
     return shares
 
