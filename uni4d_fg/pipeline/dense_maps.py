@@ -93,6 +93,8 @@ class _Judged(NamedTuple):
     """(N, 2) landmarks, px ..."""
     log_z: FloatArray
     """... and their log depth."""
+    share: FloatArray | None
+    """(N,) part of its weight that each has; None for all of it."""
     unmasked: BoolArray
     """(h, w)"""
     static: BoolArray
@@ -301,6 +303,7 @@ class DenseMaps:
         unmasked = ~self.size.marked(self.sequence.masks[frame])
         static = without_band(unmasked, self.config.multiview.mask_band_px)
         uv, log_scale_at, log_cue = self._landmark_cues(frame)
+        share = self._shares(frame)
         if not broken:
             # The cue is read where the landmark is, between pixels: its error there holds for the pixel nearest.
             column, row = np.clip(np.rint(uv), 0, (self.size.width - 1, self.size.height - 1)).astype(np.int64).T
@@ -308,11 +311,11 @@ class DenseMaps:
             log_cue = np.where(np.isfinite(nearest), np.log(nearest), log_cue)
         log_z = log_scale_at + log_cue
         log_scale = float(self.scene["log_scale"][frame])
-        errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config)
-        return _Judged(cue, uv, log_z, unmasked, static, errors)
+        errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config, share)
+        return _Judged(cue, uv, log_z, share, unmasked, static, errors)
 
     def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
-        known = known_depth(measured, judged.uv, judged.log_z, judged.static, judged.cue.shape)
+        known = known_depth(measured, judged.uv, judged.log_z, judged.static, judged.cue.shape, judged.share)
         like_moving = np.zeros_like(judged.static)
         if self.bleeding_px > 0 and not judged.static.all():
             like_moving = looks_moving(self.sequence.images[frame], self.sequence.masks[frame], judged.static)
@@ -342,6 +345,11 @@ class DenseMaps:
         mine = self.control[frame]
         usable = (mine.instance == 0) & np.isfinite(mine.log_scale)
         return self.size.pixels(mine.uv[usable]), mine.log_scale[usable], np.log(mine.cue[usable])
+
+    def _shares(self, frame: int) -> FloatArray | None:
+        """Return the part of its weight that each of these landmarks has, (N,); None for all of it."""
+        mine = self.control[frame]
+        return None if mine.share is None else mine.share[(mine.instance == 0) & np.isfinite(mine.log_scale)]
 
     def _carried(self, frame: int) -> Float32Array:
         """Return a frame's depth as the nearest frames with a sound cue show it, at working size."""

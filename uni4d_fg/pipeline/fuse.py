@@ -22,6 +22,7 @@ from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
 from uni4d_fg.optim.threads import thread_count, workers_in_order
 from uni4d_fg.pipeline.dense_maps import DenseMaps
+from uni4d_fg.pipeline.landmark_sigma import landmark_shares
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.confidence_store import write_confidence
@@ -75,9 +76,10 @@ def fuse_depth(
         depths=FramesInTurn(sequence.depths),
         masks=FramesInTurn(sequence.masks),
     )
-    control = [control_points(labelled, scene, motion, frame) for frame in range(sequence.num_frames)]
-    broken = contradicting_frames(control, config)
     intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)
+    shares = landmark_shares(labelled, scene, intrinsics)
+    control = [control_points(labelled, scene, motion, frame, shares) for frame in range(sequence.num_frames)]
+    broken = contradicting_frames(control, config)
     maps = DenseMaps(
         sequence,
         control,
@@ -142,8 +144,10 @@ def _summary(maps: DenseMaps, told: ToldError) -> dict[str, Any]:
     return out
 
 
-def control_points(labelled: LabelledTracks, scene: Arrays, motion: Arrays, frame: int) -> ControlPoints:
-    """Collect the landmarks and dynamic points that are seen, with a cue, in one frame."""
+def control_points(
+    labelled: LabelledTracks, scene: Arrays, motion: Arrays, frame: int, shares: FloatArray | None = None
+) -> ControlPoints:
+    """Collect the landmarks, with the shares (L,) of their weights, and dynamic points that a frame sees with a cue."""
     pose = scene["world_T_cam"][frame]
     static_track: IntArray = scene["landmark_track"]
     seen = (labelled.weight[static_track, frame] > 0) & np.isfinite(labelled.depth[static_track, frame])
@@ -156,4 +160,5 @@ def control_points(labelled: LabelledTracks, scene: Arrays, motion: Arrays, fram
     cue = labelled.depth[track, frame].astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         log_scale = np.where(z > 0, np.log(np.maximum(z, 1e-9)) - np.log(cue), np.nan)
-    return ControlPoints(labelled.tracks.uv[track, frame].astype(np.float64), cue, log_scale, instance, points)
+    share = None if shares is None else np.concatenate([shares[seen], np.ones(int(here.sum()))])
+    return ControlPoints(labelled.tracks.uv[track, frame].astype(np.float64), cue, log_scale, instance, points, share)

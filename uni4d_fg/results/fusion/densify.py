@@ -38,6 +38,8 @@ class ControlPoints:
     """(N,) 0 static, > 0 instance."""
     points: FloatArray
     """(N, 3) world, m."""
+    share: FloatArray | None = None
+    """(N,) part of its weight that each point has, 0 to 1; None gives all their whole weight."""
 
 
 def densify_frame(

@@ -21,6 +21,8 @@ _LANDMARK_SIGMA = 0.006
 """Standard deviation of a landmark's log depth in a frame."""
 _LANDMARK_SHARE = 0.5
 """Weight of a landmark beside a sure match."""
+_JUDGING = 0.5
+"""Landmarks that have less than this part of it judge nothing."""
 _SURE = 0.8
 _RIGHT = 0.03
 _MEAN_TO_SIGMA = 1.2533
@@ -91,7 +93,12 @@ class Known:
 
 
 def known_depth(
-    measured: Measured | None, uv: FloatArray, log_z: FloatArray, static: BoolArray, shape: tuple[int, int]
+    measured: Measured | None,
+    uv: FloatArray,
+    log_z: FloatArray,
+    static: BoolArray,
+    shape: tuple[int, int],
+    share: FloatArray | None = None,
 ) -> Known:
     """Bring depth from several views and landmarks onto one grid.
 
@@ -105,18 +112,22 @@ def known_depth(
         log_z: (N,) their log depth.
         static: (h, w) where nothing moves.
         shape: (h, w).
+        share: (N,) part of its weight that a landmark has, 0 to 1; None for all of it.
     """
     column, row = np.rint(uv).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
     inside[inside] = static[row[inside], column[inside]]
     at, log_z = (row[inside], column[inside]), log_z[inside]
+    landmark = np.full(len(log_z), _LANDMARK_SHARE) if share is None else _LANDMARK_SHARE * share[inside]
     log_depth = np.full(shape, np.nan, np.float32)
     weight = np.zeros(shape, np.float32)
     shared, reliability = 0.0, 0.0
     if measured is not None:
         log_depth = measured.log_depth.copy()
         weight = np.where(static, np.maximum(measured.confidence - 0.5, 0) * 2, np.float32(0)).astype(np.float32)
-        sure = (measured.confidence[at] > _SURE) & ~_beside_edges(measured)[at]
+        sure = (
+            (measured.confidence[at] > _SURE) & ~_beside_edges(measured)[at] & (landmark >= _JUDGING * _LANDMARK_SHARE)
+        )
         shared = _UNCHECKED_SIGMA
         if np.count_nonzero(sure) >= _MIN_COMPARED:
             difference = log_depth[at][sure] - log_z[sure]
@@ -127,10 +138,10 @@ def known_depth(
             reliability = float(np.clip((agreeing - _AT_WORST) / (_AT_BEST - _AT_WORST), 0.0, 1.0))
         # Squared: pixels that share an error are not as many witnesses as there are pixels.
         weight *= np.float32(reliability * (_LANDMARK_SIGMA**2 / (_LANDMARK_SIGMA**2 + shared**2)) ** 2)
-    trusted = weight[at] < _LANDMARK_SHARE
+    trusted = weight[at] < landmark
     at = at[0][trusted], at[1][trusted]
     log_depth[at] = log_z[trusted]
-    weight[at] = _LANDMARK_SHARE
+    weight[at] = landmark[trusted]
     return Known(KnownDepth(log_depth, weight), shared, reliability)
 
 
@@ -228,6 +239,7 @@ def held_out_errors(
     static: BoolArray,
     default_log_scale: float,
     config: FusionConfig,
+    share: FloatArray | None = None,
 ) -> HeldOut:
     """Judge the corrected cue and matched depth by landmarks that neither has seen.
 
@@ -241,7 +253,10 @@ def held_out_errors(
         static: (h, w) where nothing moves.
         default_log_scale: Of the frame, where next to nothing is known.
         config: Fusion.
+        share: (N,) part of its weight that a landmark has, 0 to 1; None for all of it.
     """
+    if share is not None:
+        uv, log_z = uv[share >= _JUDGING], log_z[share >= _JUDGING]
     held = np.random.default_rng(0).random(len(log_z)) < _HELD_OUT
     shape = (cue.shape[0], cue.shape[1])
     others = known_depth(None, uv[~held], log_z[~held], static, shape)

@@ -1,0 +1,58 @@
+"""How well the cameras determine the depth of each landmark: near the direction of motion they hardly do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.geometry.camera import world_to_camera
+from uni4d_fg.pipeline.steps import Arrays
+
+_LEAST_SIGMA = 0.004
+"""Landmarks that are known this well all count alike: standard deviation of log depth."""
+_WORSE = 4.0
+"""And so do those that are worse than the median one by less than this."""
+
+
+def landmark_shares(labelled: LabelledTracks, scene: Arrays, intrinsics: FloatArray) -> FloatArray:
+    """Return what part of its weight each landmark (L,) has, 0 to 1, by how sure its depth is beside that of others.
+
+    Where the camera shows parallax of some landmarks only, those of the others follow the noise of their tracks. Where
+    it shows none, all are alike, and all have their whole weight.
+
+    Args:
+        labelled: Observations.
+        scene: Record of stage 2.
+        intrinsics: (T, 4) px.
+    """
+    points: FloatArray = scene["landmarks"]
+    poses: FloatArray = scene["world_T_cam"]
+    if not len(points):
+        return np.zeros(0)
+    weight = labelled.weight[scene["landmark_track"]] > 0
+    information = np.zeros((len(points), 3, 3))
+    for frame, pose in enumerate(poses):
+        seen = np.flatnonzero(weight[:, frame])
+        x = world_to_camera(np.broadcast_to(pose, (len(seen), 4, 4)), points[seen])
+        seen, x = seen[x[:, 2] > 0], x[x[:, 2] > 0]
+        focal = intrinsics[frame, :2]
+        jacobian = np.zeros((len(seen), 2, 3))
+        jacobian[:, [0, 1], [0, 1]] = focal / x[:, 2:]
+        jacobian[:, :, 2] = -focal * x[:, :2] / x[:, 2:] ** 2
+        jacobian = jacobian @ pose[:3, :3].T
+        information[seen] += np.swapaxes(jacobian, 1, 2) @ jacobian
+    noise_px, noise_depth = (float(value) for value in scene["noise"])
+    first = np.argmax(weight, axis=1)
+    away = points - poses[first, :3, 3]
+    distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+    information /= noise_px**2
+    information += np.eye(3) * 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None]
+    information[np.trace(information, axis1=1, axis2=2) <= 0] = np.eye(3)
+    toward = away / distance[:, None]
+    variance = np.einsum("li,lij,lj->l", toward, np.linalg.inv(information), toward) / distance**2
+    # Landmarks also know what the cue says in all of their frames.
+    of_cue = np.count_nonzero(weight, axis=1) / max(noise_depth, 1e-6) ** 2
+    sigma = 1 / np.sqrt(1 / np.maximum(variance, 1e-12) + of_cue)
+    shares: FloatArray = np.minimum(max(_LEAST_SIGMA, _WORSE * float(np.median(sigma))) / sigma, 1.0) ** 2
+    return shares
