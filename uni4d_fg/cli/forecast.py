@@ -180,8 +180,8 @@ def expected_shares(
 
     The costs are seconds on two cores of videos of 24 to 60 frames of 0.08 to 0.3 megapixels: a constant, and so much
     per megapixel of the whole video. How many points there are is not known before, nor whether a depth cue is so wrong
-    that depth is matched between frames, which makes fusion three to four times as long: a given one is taken
-    so that a whole run is off by about the same factor with a bad cue as with a good one.
+    that depth is matched between frames, which makes fusion three to four times as long: what is expected with
+    a given one is off by about the same factor for the whole run, too little if it is bad and too much if it is good.
 
     Args:
         num_frames: T.
