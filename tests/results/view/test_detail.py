@@ -58,6 +58,7 @@ def stage(page: Any, renderer: str) -> None:
     page.route(
         "http://stage/", lambda route: route.fulfill(body=STAGE.replace("SCRIPT", script), content_type="text/html")
     )
+    page.goto("about:blank")
     page.goto(f"http://stage/#{renderer}")
 
 
@@ -101,3 +102,28 @@ def test_a_picture_that_stands_still_gets_more_and_one_after_a_key_less() -> Non
         page.evaluate("now += 900")
         page.keyboard.press("ArrowRight")
         assert page.evaluate("picture(30)")["drawn"] == pytest.approx(moving["drawn"], rel=0.02)
+
+
+def test_pictures_that_would_be_the_same_are_left_out_by_software_until_something_happens() -> None:
+    def drawn(renderer: str, then: str, count: int) -> int:
+        stage(page, renderer)
+        page.evaluate("turn(80)")
+        page.evaluate("for (let k = 0; k < 4; k++) picture(1000)")
+        before = page.evaluate("window.uni4dDetail.frames")
+        page.evaluate(f"for (let k = 0; k < {count}; k++) {then}")
+        return int(page.evaluate("window.uni4dDetail.frames")) - int(before)
+
+    with browser_page() as page:
+        assert drawn(SLOW_SOFTWARE, "picture(1000)", 30) == 3
+        assert drawn(GPU, "picture(1000)", 30) == 30
+        # What the server sends is followed by a few pictures at once: all but the first are drawn, and quickly.
+        assert drawn(SLOW_SOFTWARE, "(picture(1000), turn(4))", 1) == 4
+        assert page.evaluate("window.uni4dDetail.drawn") < 7000
+        assert drawn(SLOW_SOFTWARE, "(context.canvas.width += 10, picture(1000))", 5) == 5
+        stage(page, SLOW_SOFTWARE)
+        page.evaluate("turn(80); for (let k = 0; k < 6; k++) picture(1000)")
+        before = page.evaluate("window.uni4dDetail.frames")
+        page.evaluate("now += 700")
+        page.keyboard.press("ArrowRight")
+        page.evaluate("picture(5)")
+        assert page.evaluate("window.uni4dDetail.frames") == before + 1

@@ -8,10 +8,11 @@
 //
 // Software draws a picture while the one before it is shown, so that what a key asks for waits for one or two of them:
 // it aims at a higher rate. Few large points cost it as much as many small ones, so that below the fewest points that
-// still show a scene, these get smaller.
+// still show a scene, these get smaller. viser draws once a second, whatever happens: such a picture would be the same as
+// the one before, and a key would wait for it, so that most of these are left out, which leaves the last one in place.
 (() => {
   if (window.uni4dDetail || !window.WebGL2RenderingContext) return;
-  const TARGET_MS = 43, SOFTWARE_MS = 27, TOUCH_MS = 300, QUIET_MS = 800, STILL_FACTOR = 6, STILL_MOST = 20;
+  const TARGET_MS = 43, SOFTWARE_MS = 27, TOUCH_MS = 300, QUIET_MS = 800, STILL_FACTOR = 6, STILL_MOST = 20, LEFT_OUT = 9;
   const FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24, SMALLEST_PX = 6;
   const state = (window.uni4dDetail = { budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false, circles: 0 });
   // Without a graphics card, smoothing of edges costs more than everything else; points have none.
@@ -34,7 +35,7 @@
   const NAMES = ["scale", "modelViewMatrix", "projectionMatrix"];
   const located = new WeakMap(), values = new WeakMap();
   let program = null, still = 0, asked = 0, shown = 0, moving = false, begun = false, before = 0, drewBefore = false;
-  let touched = -1e9, last = -1e9, answered = true;
+  let touched = -1e9, last = -1e9, answered = true, settled = false, decided = false, skip = false, skipped = 0, size = "";
 
   const wrap = (name, make) => { const inner = gl2[name]; gl2[name] = make(inner); return inner; };
   wrap("useProgram", (inner) => function (next) { program = next; return inner.call(this, next); });
@@ -71,7 +72,21 @@
     const pixels = scale / Math.max(depth - radius, 1e-6);
     return Math.min(1, pixels * pixels);
   };
-  const draw = wrap("drawArrays", (inner) => function (mode, first, count) {
+  // Whether a picture is left out, asked before anything of it is drawn: only where nothing has happened for a while.
+  const leftOut = (gl) => {
+    if (decided) return skip;
+    decided = true;
+    const now = performance.now(), here = `${gl.drawingBufferWidth} ${gl.drawingBufferHeight}`;
+    skip = software === true && settled && answered && now - last > QUIET_MS && here === size && skipped < LEFT_OUT;
+    skipped = skip ? skipped + 1 : 0;
+    size = here;
+    if (skip) last = now;
+    return skip;
+  };
+  for (const name of ["clear", "drawElements", "drawElementsInstanced", "drawArraysInstanced"])
+    wrap(name, (inner) => function (...rest) { if (!leftOut(this)) inner.apply(this, rest); });
+  wrap("drawArrays", (inner) => function (mode, first, count) {
+    if (leftOut(this)) return;
     const places = mode === this.POINTS && count > SMALL && !state.everything && program && located.get(program);
     const [scale, view, projection] = places ? NAMES.map((name) => values.get(places[name])) : [];
     if (!scale || !view || !projection) return inner.call(this, mode, first, count);
@@ -108,6 +123,7 @@
   const tick = (now) => {
     const drew = begun;
     if (drew) {
+      settled = !moving && (shown >= asked || STILL_FACTOR * 2 ** (still - 1) >= STILL_MOST);
       state.wanted = asked; state.drawn = shown; state.frames += 1;
       asked = shown = 0;
       if (drewBefore && moving) {
@@ -117,7 +133,7 @@
         state.budget = Math.min(Math.max(state.budget, (FEWEST * SMALLEST_PX) / LARGEST_PX), MOST);
       }
     }
-    begun = false;
+    begun = decided = skip = false;
     drewBefore = drew; before = now;
     requestAnimationFrame(tick);
   };
