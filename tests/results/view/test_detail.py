@@ -122,6 +122,9 @@ def test_pictures_that_would_be_the_same_are_left_out_by_software_until_somethin
         assert drawn(SLOW_SOFTWARE, "(context.canvas.width += 10, picture(1000))", 5) == 5
         stage(page, SLOW_SOFTWARE)
         page.evaluate("turn(80); for (let k = 0; k < 6; k++) picture(1000)")
+        page.evaluate("window.uni4dDetail.everything = true")
+        assert page.evaluate("(picture(1000), spent)") > 1000.0
+        page.evaluate("window.uni4dDetail.everything = false")
         before = page.evaluate("window.uni4dDetail.frames")
         page.evaluate("now += 700")
         page.keyboard.press("ArrowRight")

@@ -77,7 +77,7 @@
     if (decided) return skip;
     decided = true;
     const now = performance.now(), here = `${gl.drawingBufferWidth} ${gl.drawingBufferHeight}`;
-    skip = software === true && settled && answered && now - last > QUIET_MS && here === size && skipped < LEFT_OUT;
+    skip = software === true && !state.everything && settled && answered && now - last > QUIET_MS && here === size && skipped < LEFT_OUT;
     skipped = skip ? skipped + 1 : 0;
     size = here;
     if (skip) last = now;
