@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import mmap
 import os
 import secrets
 import shutil
@@ -303,6 +304,13 @@ def load_npy(path: Path, *, memory_map: bool = False) -> npt.NDArray[Any]:
     if checksums is not None and len(checksums) == 1 and zlib.crc32(np.ascontiguousarray(array).data) != checksums[0]:
         raise InputError(f"{path}: is damaged, its checksum does not fit its data; make it again")
     return array
+
+
+def forget_pages(array: npt.NDArray[Any]) -> None:
+    """Let go of what was read of a memory-mapped array; it is read again when it is asked for."""
+    mapped = getattr(array, "_mmap", None)
+    if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def load_npz(

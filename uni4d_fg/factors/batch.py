@@ -98,8 +98,8 @@ class FactorBatch:
         """Name of the term in summaries and messages."""
         return self.term or self.factor_type.term
 
-    def take(self, rows: IntArray) -> FactorBatch:
-        """Return the batch with the given rows, in the given order."""
+    def take(self, rows: IntArray | slice) -> FactorBatch:
+        """Return the batch with the given rows, in the given order; with a slice, without copying them."""
         return replace(
             self,
             slots=tuple(Slot(s.variable, s.rows[rows]) for s in self.slots),

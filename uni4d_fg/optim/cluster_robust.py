@@ -36,11 +36,14 @@ from uni4d_fg.optim.few_clusters import blend
 from uni4d_fg.optim.layout import DenseLayout
 from uni4d_fg.optim.marginals import CameraMarginals, camera_marginals
 from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.threads import map_in_order, thread_count, workers_in_order
 
 MIN_CLUSTERS = 8
 """With fewer, their spread says too little, and errors count as independent."""
 _MIN_SLOPE = 0.05
 """Smallest ratio of a kernel's mean slope to its mean weight that is believed."""
+_PART_ROWS = 1 << 16
+"""Factors that are linearized at once."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,17 @@ def curvature_batch(batch: FactorBatch, state: State) -> FactorBatch:
     """Return a quadratic batch whose Hessian is the mean curvature of a robust one at ``state``."""
     if batch.kernel.kind == "quadratic" or len(batch) == 0:
         return batch
-    return replace(batch, weight=batch.weight * _mean_curvature(batch, batch.squared_norm(state)), kernel=Kernel())
+    return replace(batch, weight=batch.weight * _mean_curvature(batch, _squared_norms(batch, state)), kernel=Kernel())
+
+
+def _parts(batch: FactorBatch) -> list[slice]:
+    return [slice(start, start + _PART_ROWS) for start in range(0, len(batch), _PART_ROWS)]
+
+
+def _squared_norms(batch: FactorBatch, state: State) -> FloatArray:
+    """Return what :meth:`FactorBatch.squared_norm` does, in parts."""
+    found = map_in_order(lambda part: batch.take(part).squared_norm(state), _parts(batch), thread_count())
+    return np.concatenate(found) if found else np.zeros(0)
 
 
 def _mean_curvature(batch: FactorBatch, squared: FloatArray) -> FloatArray:
@@ -242,34 +255,69 @@ def _add_scores(
     """
     count = len(state[eliminate])
     hessian, gradient = np.zeros((count, 9)), np.zeros((count, 3))
-    rows = []
     curvature, weights = 0.0, 0.0
+    plans = []
     for batch in batches:
-        at = next(i for i, s in enumerate(batch.slots) if s.variable == eliminate)
-        landmark = batch.slots[at].rows
-        r, jacobians = linearize_batch(replace(batch, kernel=Kernel()), state)
-        squared = np.einsum("nd,nd->n", r, r) / np.maximum(batch.weight, 1e-300)
+        squared = _squared_norms(batch, state)
         curved, weight = _mean_curvature(batch, squared), batch.kernel.weight(squared)
         curvature, weights = curvature + float(curved.sum()), weights + float(weight.sum())
-        r = r * weight[:, None]
-        point = jacobians[at]
-        block = (np.swapaxes(point, 1, 2) @ (curved[:, None, None] * point)).reshape(-1, 9)
-        slope = np.einsum("nda,nd->na", point, r)
-        for a in range(9):
-            hessian[:, a] += np.bincount(landmark, block[:, a], count)
-        for a in range(3):
-            gradient[:, a] += np.bincount(landmark, slope[:, a], count)
-        rows.append((batch, at, landmark, r, jacobians, curved))
+        at = next(i for i, s in enumerate(batch.slots) if s.variable == eliminate)
+        plans += [_ScoredPart(replace(batch, kernel=Kernel()), part, at, curved, weight) for part in _parts(batch)]
     step = np.zeros((count, 3))
-    if not held:
-        step = (np.linalg.pinv(hessian.reshape(-1, 3, 3), hermitian=True) @ gradient[:, :, None])[:, :, 0]
-    for batch, at, landmark, r, jacobians, curved in rows:
-        pull = r - curved[:, None] * np.einsum("nda,na->nd", jacobians[at], step[landmark])
-        start = clusters.of_landmark[landmark] * layout.size
-        for i, slot in enumerate(batch.slots):
-            if i == at or slot.variable not in layout.offset:
+    with workers_in_order(thread_count()) as mapped:
+        if not held:
+            for block, slope in mapped(lambda part: part.landmark_equations(state, count), plans):
+                hessian += block
+                gradient += slope
+            step = (np.linalg.pinv(hessian.reshape(-1, 3, 3), hermitian=True) @ gradient[:, :, None])[:, :, 0]
+        for added in mapped(lambda part: part.scores(state, layout, clusters, step), plans):
+            scores += added
+    return curvature / weights if weights > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class _ScoredPart:
+    """Some rows of a batch on landmarks, linearized when asked: all Jacobians at once would fill the memory."""
+
+    batch: FactorBatch
+    """Without its kernel."""
+    part: slice
+    at: int
+    """The landmarks' slot."""
+    curvature: FloatArray
+    """Of the kernel at all rows of the batch, as :func:`_mean_curvature` says."""
+    weight: FloatArray
+    """The kernel's weight at all rows of the batch."""
+
+    def _linearized(self, state: State) -> tuple[FactorBatch, FloatArray, list[FloatArray]]:
+        taken = self.batch.take(self.part)
+        r, jacobians = linearize_batch(taken, state)
+        return taken, r * self.weight[self.part, None], jacobians
+
+    def landmark_equations(self, state: State, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return the rows' share in the landmarks' Hessians (N, 9) and gradients (N, 3)."""
+        taken, r, jacobians = self._linearized(state)
+        point, landmark = jacobians[self.at], taken.slots[self.at].rows
+        block = (np.swapaxes(point, 1, 2) @ (self.curvature[self.part, None, None] * point)).reshape(-1, 9)
+        slope = np.einsum("nda,nd->na", point, r)
+        return _summed(landmark, block, count), _summed(landmark, slope, count)
+
+    def scores(self, state: State, layout: DenseLayout, clusters: Clusters, step: FloatArray) -> FloatArray:
+        """Return the rows' share in the scores (G, n), landmarks moved by ``step`` (N, 3)."""
+        taken, r, jacobians = self._linearized(state)
+        landmark = taken.slots[self.at].rows
+        pull = r - self.curvature[self.part, None] * np.einsum("nda,na->nd", jacobians[self.at], step[landmark])
+        start, size = clusters.of_landmark[landmark] * layout.size, clusters.count * layout.size
+        out = np.zeros(size)
+        for i, slot in enumerate(taken.slots):
+            if i == self.at or slot.variable not in layout.offset:
                 continue
             place = start[:, None] + layout.columns(slot.variable, slot.rows)
             value = np.einsum("nda,nd->na", jacobians[i], pull)
-            scores += np.bincount(place.reshape(-1), value.reshape(-1), scores.size).reshape(scores.shape)
-    return curvature / weights if weights > 0 else 1.0
+            out += np.bincount(place.reshape(-1), value.reshape(-1), size)
+        return out.reshape(clusters.count, layout.size)
+
+
+def _summed(rows: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """Return the sums (count, m) of values (K, m) by row (K,)."""
+    return np.stack([np.bincount(rows, column, count) for column in values.T], axis=1)
