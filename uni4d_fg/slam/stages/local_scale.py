@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import FloatArray, evenly_spread
-from uni4d_fg.optim.threads import thread_count
+from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
+from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -62,31 +62,29 @@ def predict_log_scale(
     whole_frame = LocalScale(frame_log_scale[queries.frame], frame_sigma, frame_sigma)
     if neighbors == 0:
         return whole_frame
-    predicted, errors = np.zeros(len(queries)), [np.zeros(0)]
-    threads = thread_count()
     usable = np.flatnonzero(np.isfinite(deviation))
-    for frame in range(len(frame_log_scale)):
+
+    def of_frame(frame: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return the queries of a frame, what is predicted for them, and errors of predictions on the static scene."""
         known = usable[static.frame[usable] == frame]
         mine = np.flatnonzero(queries.frame == frame)
         if len(known) <= neighbors:
-            continue
+            return mine[:0], np.zeros(0), np.zeros(0)
         # Points spread over an image need no balanced tree, which takes longer to build.
         tree, values = cKDTree(static.uv[known], balanced_tree=False), deviation[known]
         sample = evenly_spread(len(known), samples)
-        away = 0.0
+        predicted, away = np.zeros(len(mine)), 0.0
         if len(mine):
-            distance, near = (
-                found.reshape(len(mine), -1) for found in tree.query(queries.uv[mine], neighbors, workers=threads)
-            )
-            predicted[mine] = np.median(values[near], axis=1)
+            distance, near = (found.reshape(len(mine), -1) for found in tree.query(queries.uv[mine], neighbors))
+            predicted = np.median(values[near], axis=1)
             away = float(np.median(distance[:, 0]))
-        uv = static.uv[known]
+        uv, errors = static.uv[known], [np.zeros(0)]
         for direction in _DIRECTIONS:
             at = uv[sample] + away * direction
             inside = np.flatnonzero(((at >= uv.min(axis=0)) & (at <= uv.max(axis=0))).all(axis=1))
             if not len(inside):
                 continue
-            _, near = tree.query(at[inside], k=neighbors + 1, workers=threads)
+            _, near = tree.query(at[inside], k=neighbors + 1)
             # Without the point itself, or else without the one that is farthest.
             own = near == sample[inside, None]
             own[~own.any(axis=1), -1] = True
@@ -94,6 +92,12 @@ def predict_log_scale(
             errors.append(values[sample[inside]] - np.median(others, axis=1))
             if away == 0.0:
                 break
+        return mine, predicted, np.concatenate(errors)
+
+    predicted, errors = np.zeros(len(queries)), [np.zeros(0)]
+    for mine, found, missed in map_in_order(of_frame, list(range(len(frame_log_scale))), thread_count()):
+        predicted[mine] = found
+        errors.append(missed)
     sigma = robust_sigma(np.concatenate(errors))
     if not sigma < frame_sigma:
         return whole_frame
