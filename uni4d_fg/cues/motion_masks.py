@@ -39,7 +39,6 @@ from uni4d_fg.cues.track_motion import SharedError, TrackMotion, find_moving_tra
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
-from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.stages.scene import Cameras
 
@@ -229,17 +228,10 @@ class _Comparison:
 
     def _evidence(self, frame: int) -> Float32Array:
         total, count = np.zeros(self.size, np.float32), 0
-        sides = [
-            [f for f in (frame - step, frame + step) if 0 <= f < self.video.num_frames]
-            for step in self.config.baselines
-        ]
-        others = [f for both in sides for f in both]
-        for f in (frame, *others):
-            self._frame(f)  # in order, and before threads ask for it
-        found = iter(map_in_order(lambda other: self._pair(frame, other), others, thread_count()))
-        for both in sides:
-            if both:
-                total += np.minimum.reduce([next(found) for _ in both])
+        for step in self.config.baselines:
+            sides = [self._pair(frame, f) for f in (frame - step, frame + step) if 0 <= f < self.video.num_frames]
+            if sides:
+                total += np.minimum.reduce(sides)
                 count += 1
         if count:
             total *= len(self.config.baselines) / count

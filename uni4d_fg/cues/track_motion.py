@@ -21,7 +21,6 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, evenly_spread
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.slam.stages.scene import Cameras
 
 _MEDIAN_OF_CHI2 = 1.386
@@ -88,13 +87,8 @@ def find_moving_tracks(
         for sign in (-1, 1)
         if 0 <= i + sign * step < num_frames
     ]
-
-    def test(pair: tuple[int, int]) -> tuple[npt.NDArray[np.int64], FloatArray, SharedError | None]:
-        return _test_pair(labelled, spread, cameras, *pair, image_size, config)
-
-    for (source, target), (track, squared, error) in zip(
-        frames, map_in_order(test, frames, thread_count()), strict=True
-    ):
+    for source, target in frames:
+        track, squared, error = _test_pair(labelled, spread, cameras, source, target, image_size, config)
         if error is not None:
             shared[source, target] = error
         if abs(target - source) in config.track_baselines:
