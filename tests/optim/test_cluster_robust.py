@@ -14,7 +14,8 @@ from uni4d_fg.factors.kernels import Kernel
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.geometry import se3
-from uni4d_fg.optim.cluster_robust import Clusters, clustered_marginals, gradient_spread, image_cells
+from uni4d_fg.optim import cluster_robust
+from uni4d_fg.optim.cluster_robust import Clusters, Spread, clustered_marginals, gradient_spread, image_cells
 from uni4d_fg.optim.levenberg_marquardt import minimize
 from uni4d_fg.optim.marginalization import marginalize_with_spread
 from uni4d_fg.optim.marginals import camera_marginals
@@ -201,3 +202,23 @@ def test_held_landmarks_are_constants_whose_errors_a_cluster_shares() -> None:
     assert 0.67 < float(np.mean(normalized)) < 1.4
     roll_and_depth = [2, 5]
     assert float(np.mean((np.mean(independent, axis=0) / variance)[roll_and_depth])) < 0.6
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_factors_in_parts_give_the_spread_of_all_at_once(monkeypatch: pytest.MonkeyPatch, held: bool) -> None:
+    problem, state = bundle(np.random.default_rng(3), num_poses=POSES, num_landmarks=LANDMARKS, depth=True)
+    marginals = camera_marginals(problem, state, CONFIG, LANDMARK)
+    assert marginals is not None
+    clusters = Clusters(np.arange(LANDMARKS) % CLUSTERS, CLUSTERS)
+
+    def spread() -> Spread:
+        return gradient_spread(problem.batches, state, marginals.layout, clusters, LANDMARK, held=held)
+
+    at_once = spread()
+    assert max(len(batch) for batch in problem.batches) > 7 * 5
+    monkeypatch.setattr(cluster_robust, "_PART_ROWS", 7)
+    in_parts = spread()
+    size = np.abs(at_once.scores).max()
+    assert size > 0
+    np.testing.assert_allclose(in_parts.scores, at_once.scores, rtol=0, atol=1e-11 * size)
+    np.testing.assert_array_equal(in_parts.rest, at_once.rest)

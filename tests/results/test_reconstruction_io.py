@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import mmap
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -230,6 +232,23 @@ def test_depth_round_trip_in_any_order(tmp_path: Path) -> None:
     expected = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
     np.testing.assert_array_equal(np.stack(list(frames)), expected)
     np.testing.assert_array_equal(np.load(path), expected)
+
+
+def resident_file_pages() -> int:
+    """Bytes of files that this process has in memory."""
+    return int(Path("/proc/self/statm").read_text().split()[2]) * mmap.PAGESIZE
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_depth_that_was_read_does_not_stay_in_memory(tmp_path: Path) -> None:
+    path, frame = tmp_path / "depth.npy", np.ones((1024, 1024), np.float32)
+    with write_depth(path, 16, frame.shape) as writer:
+        for number in range(16):
+            writer.write(number, frame)
+    before = resident_file_pages()
+    depth = read_depth(path, whole=True)
+    assert [float(values[-1, -1]) for values in depth] == [1.0] * 16
+    assert resident_file_pages() - before < 2 * frame.nbytes
 
 
 def test_interrupted_or_incomplete_depth_leaves_nothing(tmp_path: Path) -> None:
