@@ -1,4 +1,4 @@
-"""How glibc's allocator deals with large arrays.
+"""How glibc's allocator deals with large arrays, and what it keeps.
 
 By default it maps every array above some size from the system and hands it back when it is freed; the next one is
 mapped anew, and the system clears each of its pages at first touch. It also gives every thread a heap of its own, which
@@ -11,6 +11,8 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Callable
+from functools import cache
 
 SETTINGS = {"MALLOC_ARENA_MAX": 1, "MALLOC_MMAP_THRESHOLD_": 128 << 20, "MALLOC_TRIM_THRESHOLD_": 128 << 20}
 """glibc's environment variables: number of heaps; bytes from which an array is mapped; free bytes that are kept."""
@@ -24,14 +26,32 @@ def keep_freed_memory() -> None:
 
     Nothing happens with another C library, whose allocator has other rules.
     """
-    if not sys.platform.startswith("linux"):
-        return
-    try:
-        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    except OSError:
-        return
+    mallopt = _of_glibc("mallopt")
     if mallopt is None:
         return
     for variable, value in SETTINGS.items():
         if variable not in os.environ:
             mallopt(_PARAMETERS[variable], value)
+
+
+def return_free_memory() -> None:
+    """Hand freed heap pages back to the system where the C library can.
+
+    For work that allocates and frees arrays of many sizes again and again: a few small arrays that live on hold up the
+    top of the heap, and the process grows to a size that depends on the order of things, not on what it holds.
+    """
+    trim = _of_glibc("malloc_trim")
+    if trim is not None:
+        trim(0)
+
+
+@cache
+def _of_glibc(name: str) -> Callable[..., int] | None:
+    """Return a function that only glibc has; None with another C library."""
+    if not sys.platform.startswith("linux"):
+        return None
+    try:
+        found: Callable[..., int] | None = getattr(ctypes.CDLL(None), name, None)
+    except OSError:
+        return None
+    return found

@@ -1,4 +1,4 @@
-"""Array types, the namespace switch that lets one residual serve NumPy and torch, and evenly spread indices."""
+"""Array types, the namespace switch that lets one residual serve NumPy and torch, spread indices, sums by row."""
 
 from __future__ import annotations
 
@@ -27,3 +27,12 @@ def namespace(array: Array) -> Any:
 def evenly_spread(count: int, limit: int) -> IntArray:
     """Return up to ``limit`` of the indices 0 .. count - 1, evenly spread, ascending, first and last among them."""
     return np.linspace(0, count - 1, min(count, limit)).astype(np.int64)
+
+
+def sum_rows(values: FloatArray, row: IntArray, count: int) -> FloatArray:
+    """Return the sums (count, ...) of the values (N, ...) of each row (N,); 0 for a row without any."""
+    columns = int(np.prod(values.shape[1:]))
+    flat, out = values.reshape(len(values), columns), np.zeros((count, columns))
+    for column in range(columns):
+        out[:, column] = np.bincount(row, flat[:, column], count)
+    return out.reshape(count, *values.shape[1:])

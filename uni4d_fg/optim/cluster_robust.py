@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray, IntArray, sum_rows
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.kernels import Kernel
@@ -300,7 +300,7 @@ class _ScoredPart:
         point, landmark = jacobians[self.at], taken.slots[self.at].rows
         block = (np.swapaxes(point, 1, 2) @ (self.curvature[self.part, None, None] * point)).reshape(-1, 9)
         slope = np.einsum("nda,nd->na", point, r)
-        return _summed(landmark, block, count), _summed(landmark, slope, count)
+        return sum_rows(block, landmark, count), sum_rows(slope, landmark, count)
 
     def scores(self, state: State, layout: DenseLayout, clusters: Clusters, step: FloatArray) -> FloatArray:
         """Return the rows' share in the scores (G, n), landmarks moved by ``step`` (N, 3)."""
@@ -316,8 +316,3 @@ class _ScoredPart:
             value = np.einsum("nda,nd->na", jacobians[i], pull)
             out += np.bincount(place.reshape(-1), value.reshape(-1), size)
         return out.reshape(clusters.count, layout.size)
-
-
-def _summed(rows: IntArray, values: FloatArray, count: int) -> FloatArray:
-    """Return the sums (count, m) of values (K, m) by row (K,)."""
-    return np.stack([np.bincount(rows, column, count) for column in values.T], axis=1)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, sum_rows
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.state import State
@@ -82,8 +82,6 @@ def _systems(
         r, jacobians = batch.linearize(state, _KERNEL_CURVATURE)
         point = np.swapaxes(jacobians[at], 1, 2)
         product, slope = (point @ jacobians[at]).reshape(-1, 9), (point @ r[:, :, None])[:, :, 0]
-        for k in range(9):
-            hessian[:, k] += np.bincount(rows, product[:, k], len(wanted))
-        for k in range(3):
-            gradient[:, k] += np.bincount(rows, slope[:, k], len(wanted))
+        hessian += sum_rows(product, rows, len(wanted))
+        gradient += sum_rows(slope, rows, len(wanted))
     return hessian.reshape(-1, 3, 3), gradient

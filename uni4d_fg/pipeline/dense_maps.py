@@ -17,7 +17,7 @@ from uni4d_fg.results.fusion.bleeding import bleeding_radius
 from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
 from uni4d_fg.results.fusion.lifting import lifted
-from uni4d_fg.results.fusion.mask_band import looks_moving, stands_still
+from uni4d_fg.results.fusion.mask_band import STILL, looks_moving, stands_still
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import (
@@ -54,8 +54,6 @@ _TRIED_FRAMES = 3
 """Frames that are matched first: where landmarks prefer the cue in all of them, no others are matched."""
 _SURE = 0.8
 """Matched depth of this confidence tells how far the cue bleeds."""
-_STILL = 0.6
-"""Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
 _HALF = 0.5
 _BLED_SHARE = 2.0
 """Moving things take their depth from this many times as far inside as the cue bleeds in the mean."""
@@ -209,7 +207,7 @@ class DenseMaps:
             self.config.averaged_sigmas * float(np.clip(mine.depth.sigma, *_AVERAGED_SIGMA)),
         )
         sure = final_confidence(mine.depth.confidence, averaged)
-        sure[~mine.unmasked & (mine.depth.matched <= _STILL)] = 0
+        sure[~mine.unmasked & (mine.depth.matched <= STILL)] = 0
         if frame in self.broken or self.bleeding_px:
             full = np.exp(upsample_guided(averaged.log_depth, self.sequence.images[frame]))
             full[np.isnan(given)] = np.nan
@@ -342,14 +340,18 @@ class DenseMaps:
 
     def _landmark_cues(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where a frame sees landmarks, (N, 2) working px, log depth over the cue, and the log cue (N,)."""
-        mine = self.control[frame]
-        usable = (mine.instance == 0) & np.isfinite(mine.log_scale)
+        mine, usable = self.control[frame], self._usable(frame)
         return self.size.pixels(mine.uv[usable]), mine.log_scale[usable], np.log(mine.cue[usable])
 
     def _shares(self, frame: int) -> FloatArray | None:
         """Return the part of its weight that each of these landmarks has, (N,); None for all of it."""
+        share = self.control[frame].share
+        return None if share is None else share[self._usable(frame)]
+
+    def _usable(self, frame: int) -> BoolArray:
+        """Return which control points of a frame are landmarks with a cue."""
         mine = self.control[frame]
-        return None if mine.share is None else mine.share[(mine.instance == 0) & np.isfinite(mine.log_scale)]
+        return np.asarray((mine.instance == 0) & np.isfinite(mine.log_scale))
 
     def _carried(self, frame: int) -> Float32Array:
         """Return a frame's depth as the nearest frames with a sound cue show it, at working size."""

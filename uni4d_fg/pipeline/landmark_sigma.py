@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.factors.projection import chain_to_world_point, projection_derivatives
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.pipeline.steps import Arrays
@@ -36,11 +37,8 @@ def landmark_shares(labelled: LabelledTracks, scene: Arrays, intrinsics: FloatAr
         seen = np.flatnonzero(weight[:, frame])
         x = world_to_camera(np.broadcast_to(pose, (len(seen), 4, 4)), points[seen])
         seen, x = seen[x[:, 2] > 0], x[x[:, 2] > 0]
-        focal = intrinsics[frame, :2]
-        jacobian = np.zeros((len(seen), 2, 3))
-        jacobian[:, [0, 1], [0, 1]] = focal / x[:, 2:]
-        jacobian[:, :, 2] = -focal * x[:, :2] / x[:, 2:] ** 2
-        jacobian = jacobian @ pose[:3, :3].T
+        by_x, _ = projection_derivatives(np.broadcast_to(intrinsics[frame], (len(x), 4)), x)
+        jacobian = chain_to_world_point(by_x, np.broadcast_to(pose, (len(x), 4, 4)))
         information[seen] += np.swapaxes(jacobian, 1, 2) @ jacobian
     noise_px, noise_depth = (float(value) for value in scene["noise"])
     first = np.argmax(weight, axis=1)

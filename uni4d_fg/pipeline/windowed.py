@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, sum_rows
 from uni4d_fg.config.models import Config
 from uni4d_fg.counted import counted
 from uni4d_fg.errors import Cancelled
@@ -230,7 +230,7 @@ def _joined_arrays(windows: list[Window], joined: Joined, parts: list[WindowLand
     track, row = np.unique(all_tracks, return_inverse=True)
     total = np.bincount(row, count, len(track))
     stacked = np.concatenate([part.point for part in parts])
-    point = np.stack([np.bincount(row, count * stacked[:, a], len(track)) for a in range(3)], axis=1) / total[:, None]
+    point = sum_rows(count[:, None] * stacked, row, len(track)) / total[:, None]
     error = np.bincount(row, count * np.concatenate([part.error for part in parts]), len(track)) / total
     log_scale = np.zeros(len(cameras.log_scale))
     for index, (window, part) in enumerate(zip(windows, parts, strict=True)):

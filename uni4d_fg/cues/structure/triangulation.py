@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, sum_rows
 from uni4d_fg.factors.projection import chain_to_world_point, projection_derivatives
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, unproject, world_to_camera
 
@@ -77,8 +77,8 @@ def triangulate(rays: RayBundle, huber_px: float) -> Points:
     direction = np.einsum("nij,nj->ni", rays.world_T_cam[:, :3, :3], in_camera)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    matrix = _sum_rows(across, rays.row, rays.count)
-    right = _sum_rows(np.einsum("nij,nj->ni", across, center), rays.row, rays.count)
+    matrix = sum_rows(across, rays.row, rays.count)
+    right = sum_rows(np.einsum("nij,nj->ni", across, center), rays.row, rays.count)
     # Parallel rays leave one direction open: the smallest eigenvalue is about (angle)^2 / 2.
     solvable = np.linalg.eigvalsh(matrix)[:, 0] > _RIDGE
     position = np.full((rays.count, 3), np.nan)
@@ -206,12 +206,3 @@ def _residual(rays: RayBundle, position: FloatArray) -> FloatArray:
     x = world_to_camera(rays.world_T_cam, position[rays.row])
     result: FloatArray = rays.uv - project(rays.intrinsics, x)
     return result
-
-
-def _sum_rows(values: FloatArray, row: IntArray, count: int) -> FloatArray:
-    columns = int(np.prod(values.shape[1:]))
-    flat = values.reshape(len(values), columns)
-    out = np.zeros((count, columns))
-    for column in range(columns):
-        out[:, column] = np.bincount(row, flat[:, column], count)
-    return out.reshape(count, *values.shape[1:])

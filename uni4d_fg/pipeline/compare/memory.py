@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 from pathlib import Path
 from types import TracebackType
+
+from uni4d_fg.allocation import return_free_memory
 
 _STATUS = Path("/proc/self/status")
 _RESET = Path("/proc/self/clear_refs")
@@ -21,7 +22,8 @@ class PeakMemory:
 
     def __enter__(self) -> PeakMemory:
         gc.collect()
-        _release_free_pages()
+        # Memory that the allocator keeps and uses again would else not be seen.
+        return_free_memory()
         try:
             _RESET.write_text("5")
             self._before = _resident_mb("VmRSS")
@@ -35,14 +37,6 @@ class PeakMemory:
         peak = _resident_mb("VmHWM") if self._before is not None else None
         if peak is not None and self._before is not None:
             self.extra_mb = max(peak - self._before, 0.0)
-
-
-def _release_free_pages() -> None:
-    """Give what the allocator keeps back to the system: memory used again would else not be seen."""
-    try:
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
-    except (OSError, AttributeError):  # another C library
-        return
 
 
 def _resident_mb(field: str) -> float | None:

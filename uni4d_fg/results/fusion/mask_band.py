@@ -14,7 +14,7 @@ _COLOR_NOISE = 1e-3
 _NONE_AROUND = 0.01
 """A window that holds less than this part of a region says nothing of it."""
 _WHOLE = 0.99
-_STILL = 0.6
+STILL = 0.6
 """Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
 _RIM_PX = 2.0
 _RIM_STILL = 0.1
@@ -60,7 +60,7 @@ def stands_still(image: ImageArray, mask: Int32Array, matched: Float32Array, sta
     Returns:
         (h, w), whatever outside of masks.
     """
-    still = matched > _STILL
+    still = matched > STILL
     small, inside = _shrunk(image, mask, static.shape)
     if not inside.any():
         return still

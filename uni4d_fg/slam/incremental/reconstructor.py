@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import ConfigError, InputError
@@ -20,7 +21,6 @@ from uni4d_fg.optim.stage import LevenbergMarquardtRunner
 from uni4d_fg.slam.incremental.boundary import Boundary, checked_size, detached
 from uni4d_fg.slam.incremental.dynamic import DynamicWindow, in_world, moving_scales
 from uni4d_fg.slam.incremental.labels import LabelledFrame, TrackBook
-from uni4d_fg.slam.incremental.memory import return_free_memory
 from uni4d_fg.slam.incremental.model import (
     DynamicPoints,
     FinishedFrame,

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, sum_rows
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.slam.incremental.model import FinishedFrame, Landmarks
@@ -109,7 +109,7 @@ def _landmarks(parts: list[Landmarks]) -> tuple[np.ndarray, FloatArray, FloatArr
     count = np.concatenate([empty, *(part.count for part in parts)]).astype(np.float64)
     total = np.bincount(row, count, len(track))
     stacked = np.concatenate([np.zeros((0, 3)), *(part.point for part in parts)])
-    point = np.stack([np.bincount(row, count * stacked[:, a], len(track)) for a in range(3)], axis=1) / total[:, None]
+    point = sum_rows(count[:, None] * stacked, row, len(track)) / total[:, None]
     error = np.bincount(row, count * np.concatenate([np.zeros(0), *(p.error for p in parts)]), len(track)) / total
     color = np.concatenate([np.zeros((0, 3), dtype=np.uint8), *(part.color for part in parts)])[first]
     return track, point, error, color

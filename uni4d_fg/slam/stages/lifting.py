@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, sum_rows
 from uni4d_fg.geometry.camera import lifted_from, seen_from, unproject
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras
@@ -27,10 +27,10 @@ def lift(observations: Observations, cameras: Cameras) -> FloatArray:
 
 def mean_per_row(values: FloatArray, weight: FloatArray, row: IntArray, count: int) -> FloatArray:
     """Average (N, 3) values per row, ignoring NaN; rows without a finite value are NaN. Returns (count, 3)."""
-    usable = np.isfinite(values).all(axis=1)
+    usable: BoolArray = np.asarray(np.isfinite(values).all(axis=1))
     w = np.where(usable, weight, 0.0)
     total = np.bincount(row, w, count)
-    sums = np.stack([np.bincount(row, w * np.where(usable, values[:, a], 0.0), count) for a in range(3)], axis=1)
+    sums = sum_rows(w[:, None] * np.where(usable[:, None], values, 0.0), row, count)
     out: FloatArray = np.full((count, 3), np.nan)
     out[total > 0] = sums[total > 0] / total[total > 0, None]
     return out
