@@ -6,9 +6,12 @@ import pytest
 
 from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray
 from uni4d_fg.config.cues import TrackingConfig
+from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.frontend.sequence.model import ArrayFrames
+from uni4d_fg.frontend.synthetic.simulate import simulate
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
+from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
 
 HEIGHT, WIDTH, FRAMES = 120, 200, 60
 SPEED = np.array([0.4, -0.2])
@@ -88,3 +91,54 @@ def test_another_background_is_not_taken_for_the_one_before() -> None:
     tracks = track(video(behind=5), 25)
     _, passed = seen_again(tracks)
     assert (tracks.visible & passed).any(axis=1).sum() <= 1
+
+
+def test_recall_and_precision_in_a_room_with_parallax() -> None:
+    """A textured disc passes before a hand-held camera and hides what stands still for 15 frames."""
+    frames, height, width, radius = 45, 180, 240, 36.0
+    simulation = simulate(
+        SyntheticSceneConfig(
+            num_frames=frames, height=height, width=width, focal=225.0, objects="none", grid_columns=2, grid_rows=2
+        )
+    )
+    scene, images = simulation.sequence, np.stack(list(simulation.sequence.images))
+    poses, intrinsics, depths = (
+        scene.ground_truth.world_T_cam, scene.ground_truth.intrinsics, scene.ground_truth.depths,
+    )  # fmt: skip
+    assert poses is not None
+    assert intrinsics is not None
+    assert depths is not None
+    y, x = np.mgrid[:height, :width]
+    middle = np.array([width, height]) / 2 + 2 * radius / 15 * np.arange(-22, 23)[:, None] * np.array([0.8, 0.6])
+    covered = (x - middle[:, 0, None, None]) ** 2 + (y - middle[:, 1, None, None]) ** 2 < radius**2
+    front = texture(3, height, width).astype(np.uint8)
+    for t in range(frames):
+        images[t][covered[t]] = np.roll(front, (2 * t, 3 * t), (0, 1))[covered[t]][:, None]
+
+    tracks = track_grid(
+        ArrayFrames(images), TrackingConfig(grid_columns=40, grid_rows=30, query_interval=frames, bridge_frames=25)
+    )
+    start = tracks.uv[tracks.query_frame == 0, 0].astype(float)
+    column, line = np.rint(start).astype(int).T
+    points = unproject(intrinsics, start, np.asarray(depths[0], float)[line, column])
+    points = camera_to_world(np.broadcast_to(poses[0], (len(start), 4, 4)), points)
+    truth = np.stack(
+        [project(intrinsics, world_to_camera(np.broadcast_to(p, (len(start), 4, 4)), points)) for p in poses], axis=1
+    )
+    visible = tracks.visible[tracks.query_frame == 0]
+    error = np.linalg.norm(tracks.uv[tracks.query_frame == 0] - truth, axis=2)
+    pixel = np.rint(np.clip(truth, 0, [width - 1, height - 1])).astype(int)
+    hidden = covered[np.arange(frames), pixel[..., 1], pixel[..., 0]]
+    possible = joined = right = 0
+    for k in range(len(start)):
+        begin, end = int(hidden[k].argmax()), int(frames - hidden[k, ::-1].argmax())
+        inside = ((truth[k, end:] >= 8) & (truth[k, end:] <= [width - 9, height - 9])).all()
+        if begin < 6 or not visible[k, begin - 4] or error[k, begin - 4] > 1 or end > frames - 10 or not inside:
+            continue
+        found = np.flatnonzero(visible[k, end:])
+        possible += 1
+        joined += len(found) > 0
+        right += len(found) > 0 and bool(error[k, end + found[0]] < error[k, begin - 4] + 2)
+    assert possible > 60
+    assert joined > 0.75 * possible
+    assert joined - right <= 1

@@ -1,19 +1,20 @@
 """Points that something passed in front of, found again behind it.
 
-Every few frames a sweep remembers its points and the image. Points that were lost since together with most of those
-around them were hidden: a thing in front takes neighbors along, a bad point is lost alone. Hidden points are looked for
-in the frames that follow, in a view that is old enough to show nothing of what came in front:
+Every few frames a sweep remembers its points and the image, and learns from them how the still scene moves and how
+far away its points are (:mod:`uni4d_fg.frontend.tracks.scene_motion`). Points that were lost since together with
+others around them were hidden: a thing in front takes neighbors along, a bad point is lost alone. They go on as the
+scene does, unseen, and are looked for in the frames that follow, in a view that is old enough to show nothing of what
+came in front:
 
-1. Points that are still followed predict where they are (:mod:`uni4d_fg.frontend.tracks.transfer`).
-2. A few are searched around there (normalized correlation). Only if neighbors among them are found with one offset from
-   the prediction is it worth looking for the rest: where nothing came back, the search ends here.
-3. Offsets of the nearest found ones correct the prediction, and every patch is registered from there; it must look the
+1. Each is searched around where it should be, as far as that is uncertain (normalized correlation). Only where
+   neighbors are found with one offset is it worth looking on: elsewhere nothing came back.
+2. Offsets of the nearest found ones correct the others, and every patch is registered from there; it must look the
    same, be near, and lead back (:mod:`uni4d_fg.frontend.tracks.registration`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import cv2
 import numpy as np
@@ -22,20 +23,22 @@ from scipy.spatial import cKDTree
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.frontend.tracks.registration import cut_templates, register
-from uni4d_fg.frontend.tracks.transfer import transfer
+from uni4d_fg.frontend.tracks.scene_motion import Known, Motion, fit
 
 _INTERVAL = 5
 """Frames between two that are remembered and searched."""
-_REMEMBERED = 4
 _NEIGHBORS, _HIDDEN_PART = 8, 0.5
 """A point was hidden if this part of its neighbors was lost with it."""
-_LEAST_GROUP, _LEAST_FOLLOWED, _MOST_FOLLOWED, _PROBES = 6, 40, 400, 48
+_LEAST_FOLLOWED = 12
 _SIGMAS, _LEAST_RADIUS_PX, _LARGEST_RADIUS_PX = 3.0, 3, 24
-_PROBE_CORRELATION, _CORRELATION, _NEAR_PX = 0.8, 0.85, 2.0
-_AGREEMENT_PX, _AGREEING, _OF_NEAREST = 3.0, 3, 5
+_LEAST_CORRELATION, _PROBE_CORRELATION, _CORRELATION, _NEAR_PX = 0.6, 0.8, 0.85, 2.0
+_AGREEMENT_PX, _AGREEING, _OF_NEAREST = 2.0, 3, 5
 """A probe counts if this many of the nearest ones, itself included, have its offset."""
 _LEAST_AREA = 0.5
 """A view that is stretched or shrunk in area by more is not looked for."""
+_NEW_SIGMA, _DRIFT, _NEW_STILL, _LEAST_STILL = (0.1, 0.5), 0.005, (0.1, 0.5, 0.9), 0.4
+"""What is known of the inverse depth of new points, as a part of it; what it loses between two frames; how likely it is
+that they are at rest: at least, at most, and in the first frame."""
 
 Found = tuple[IntArray, Float32Array]
 """Tracks (n,) and where they are, (n, 2) px."""
@@ -48,13 +51,9 @@ class _Remembered:
     image: ImageArray
     track: IntArray
     """(N,) followed there, ascending."""
-    points: Float32Array
+    points: FloatArray
     """(N, 2) px."""
-
-    @classmethod
-    def of(cls, image: ImageArray, track: IntArray, points: Float32Array) -> _Remembered:
-        order = np.argsort(track)
-        return cls(image, track[order], points[order])
+    known: Known
 
     def rows(self, track: IntArray) -> tuple[IntArray, BoolArray]:
         """Return the row of tracks (n,), and whether (n,) they were followed here; if not, the row means nothing."""
@@ -66,46 +65,66 @@ class _Remembered:
 
 @dataclass
 class _Hidden:
-    """Points that were hidden together."""
+    """Points (N,) that are hidden at present."""
 
-    step: int
-    """Of the sweep, when they were last followed."""
-    seen: _Remembered
-    """The frame in which they are known."""
-    before: list[_Remembered]
-    """Frames before that one, from the oldest."""
     track: IntArray
-    """(N,) those that were not found yet."""
+    step: IntArray
+    """Of the sweep, when they were last followed."""
+    view: IntArray
+    """The image in which they are known."""
+    at: FloatArray
+    """(N, 2) px in that image."""
+    still: FloatArray
+    points: FloatArray
+    """(N, 2) px where they should be."""
+    affine: FloatArray
+    """(N, 2, 2) from their view to the present."""
+    inverse_depth: FloatArray
+    sigma: FloatArray
+    """Its standard deviation."""
+    error: FloatArray
+    """(N, 2) px by which they are off if their inverse depth is by one standard deviation."""
+    variance: FloatArray
+    """px^2, of ``points``, by what is not known of the camera."""
 
-    def points(self) -> FloatArray:
-        return self.seen.points[self.seen.rows(self.track)[0]].astype(np.float64)
+    @classmethod
+    def none(cls) -> _Hidden:
+        return cls.of(np.zeros(0, np.int64), 0, 0, np.zeros((0, 2)), Known(np.zeros(0), np.zeros(0), np.zeros(0)))
 
-    def predict(self, now: _Remembered) -> tuple[FloatArray, FloatArray]:
-        """Return the warps (N, 6) and standard deviations (N,) px; NaN and infinite where nothing tells."""
-        at = self.points()
-        warp, sigma = np.full((len(at), 6), np.nan), np.full(len(at), np.inf)
-        both, there, here = np.intersect1d(self.seen.track, now.track, assume_unique=True, return_indices=True)
-        todo = np.ones(len(at), np.bool_)
-        for before in (*self.before, None):
-            # A point's parallax shows the better the longer it was followed; a young one has none to show.
-            known, mine, displacement, at_displacement = np.arange(len(both)), todo, None, None
-            if before is not None:
-                known = np.flatnonzero(before.rows(both)[1])
-                mine = todo & before.rows(self.track)[1]
-            if len(known) < _LEAST_FOLLOWED or not mine.any():
-                continue
-            known = known[np.linspace(0, len(known) - 1, min(_MOST_FOLLOWED, len(known))).astype(np.int64)]
-            source = self.seen.points[there[known]].astype(np.float64)
-            if before is not None:
-                displacement = source - before.points[before.rows(both[known])[0]]
-                at_displacement = at[mine] - before.points[before.rows(self.track[mine])[0]]
-            height, width = now.image.shape
-            warp[mine], sigma[mine] = transfer(
-                source, displacement, now.points[here[known]].astype(np.float64), at[mine], at_displacement,
-                (height, width),
-            )  # fmt: skip
-            todo = todo & ~mine
-        return warp, sigma
+    @classmethod
+    def of(cls, track: IntArray, step: int, view: int, at: FloatArray, known: Known) -> _Hidden:
+        count = len(track)
+        return cls(
+            track, np.full(count, step), np.full(count, view), at, known.still, at.copy(),
+            np.tile(np.eye(2), (count, 1, 1)), known.inverse_depth, known.sigma, np.zeros((count, 2)), np.zeros(count),
+        )  # fmt: skip
+
+    def joined(self, other: _Hidden) -> _Hidden:
+        return _Hidden(*(np.concatenate((getattr(self, f.name), getattr(other, f.name))) for f in fields(self)))
+
+    def picked(self, rows: BoolArray | IntArray) -> _Hidden:
+        return _Hidden(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def move(self, motion: Motion) -> None:
+        """Go on as the scene does."""
+        by_motion = motion.by_motion(self.points, self.inverse_depth)
+        by_depth, change = motion.by_inverse_depth(self.points, self.inverse_depth)
+        moved, inverse_depth = motion.move(self.points, self.inverse_depth)
+        beside = [motion.move(self.points + step, self.inverse_depth)[0] - moved for step in np.eye(2)]
+        affine = np.stack(beside, axis=2)
+        self.error = np.einsum("nij,nj->ni", affine, self.error) + by_depth * self.sigma[:, None]
+        area = np.abs(np.linalg.det(affine))
+        self.variance = area * self.variance + 0.5 * ((by_motion @ motion.covariance) * by_motion).sum(axis=(1, 2))
+        self.affine = affine @ self.affine
+        self.points, self.inverse_depth, self.sigma = moved, inverse_depth, self.sigma * change
+
+    def known(self) -> Known:
+        return Known(self.inverse_depth, self.sigma, self.still)
+
+    def spread(self) -> FloatArray:
+        """Return the standard deviations (N, 2) px of where they are."""
+        result: FloatArray = np.sqrt(self.variance[:, None] + self.error**2)
+        return result
 
 
 @dataclass
@@ -114,7 +133,11 @@ class Bridges:
 
     config: TrackingConfig
     _remembered: list[_Remembered] = field(default_factory=list)
-    _hidden: list[_Hidden] = field(default_factory=list)
+    """The last two frames."""
+    _motions: list[Motion] = field(default_factory=list)
+    """Between them, and from the second one to the present."""
+    _views: dict[int, ImageArray] = field(default_factory=dict)
+    _hidden: _Hidden = field(default_factory=_Hidden.none)
     _step: int = -1
 
     def find(self, image: ImageArray, track: IntArray, points: Float32Array) -> Found:
@@ -126,122 +149,207 @@ class Bridges:
             points: (N, 2) px where they are.
         """
         self._step += 1
-        found: list[Found] = [(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))]
-        if self._step % _INTERVAL == 0:
-            now = _Remembered.of(image, track, points)
-            oldest = self._step - self.config.bridge_frames
-            self._hidden = [group for group in self._hidden if group.step >= oldest]
-            found += [_search(group, now, self.config.patch_px // 2, self.config) for group in self._hidden]
-        again, where = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        if self._step % _INTERVAL == 0:
-            self._remember(_Remembered.of(image, np.concatenate((track, again)), np.concatenate((points, where))))
-        return again, where
+        nothing = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+        if self._step % _INTERVAL != 0:
+            return nothing
+        order = np.argsort(track)
+        track, at = track[order], points[order].astype(np.float64)
+        known = self._learn(image, track, at)
+        self._hide(track)
+        rows, there = _search(self._hidden, self._views, image, self.config)
+        found = self._hidden.picked(rows)
+        keep = np.ones(len(self._hidden.track), np.bool_)
+        keep[rows] = False
+        self._hidden = self._hidden.picked(keep)
+        again = found.known()
+        self._remember(
+            image,
+            np.concatenate((track, found.track)),
+            np.concatenate((at, there)),
+            Known(*(np.concatenate((getattr(known, f.name), getattr(again, f.name))) for f in fields(Known))),
+        )
+        return found.track, there.astype(np.float32)
 
-    def _remember(self, now: _Remembered) -> None:
-        """Note what was hidden since the frame that was remembered last."""
-        if len(self._remembered) >= 2:
-            *before, seen, last = self._remembered
-            track = _lost_with_neighbors(last, now)
-            old = seen.rows(track)[1]
-            # Young tracks were not there yet: they are known in the last frame only.
-            for view, earlier, members in ((seen, before, track[old]), (last, [], track[~old])):
-                if len(members) >= _LEAST_GROUP:
-                    self._hidden.append(_Hidden(self._step - _INTERVAL, view, earlier, members))
-        self._remembered = [*self._remembered, now][-_REMEMBERED:]
+    def _learn(self, image: ImageArray, track: IntArray, at: FloatArray) -> Known:
+        """Find how the scene moved, and return what is known of the points (N,): NaN for new ones."""
+        known = Known(*(np.full(len(track), np.nan) for _ in range(3)))
+        height, width = image.shape
+        motion = Motion.none((height, width))
+        if self._remembered:
+            last = self._remembered[-1]
+            row, old = last.rows(track)
+            row = row[old]
+            if len(row) >= _LEAST_FOLLOWED:
+                start = self._motions[-1] if self._motions else motion
+                motion, then = fit(start, last.points[row], at[old], last.known.picked(row))
+                _, change = motion.by_inverse_depth(last.points[row], then.inverse_depth)
+                _, inverse_depth = motion.move(last.points[row], then.inverse_depth)
+                known.inverse_depth[old], known.still[old] = inverse_depth, then.still
+                known.sigma[old] = np.hypot(then.sigma * change, _DRIFT * inverse_depth)
+            self._motions = [*self._motions, motion][-2:]
+        return known
+
+    def _hide(self, track: IntArray) -> None:
+        """Add what was lost since the frame that was remembered last to what is hidden, and move all to the present."""
+        if not self._remembered:
+            return
+        last = self._remembered[-1]
+        lost = _lost_with_neighbors(last, np.isin(last.track, track, assume_unique=True), self._hidden.points)
+        self._hidden = self._hidden.picked(self._hidden.step >= self._step - self.config.bridge_frames)
+        self._hidden.move(self._motions[-1])
+        # What came in front may be in the windows of the last frame: points are known in the one before that.
+        todo = np.ones(len(lost), np.bool_)
+        for age, frame in enumerate(self._remembered):
+            row, followed = frame.rows(lost)
+            # Where something goes that moves by itself is not known.
+            there = followed & todo & (frame.known.still[row] >= _LEAST_STILL)
+            todo &= ~followed
+            row = row[there]
+            first = self._step - _INTERVAL * (len(self._remembered) - age)
+            new = _Hidden.of(lost[there], self._step - _INTERVAL, first, frame.points[row], frame.known.picked(row))
+            for motion in self._motions[age - len(self._remembered) :]:
+                new.move(motion)
+            self._hidden = self._hidden.joined(new)
+        self._views = {
+            step: view
+            for step, view in self._views.items()
+            if (self._hidden.view == step).any() or step >= self._step - 2 * _INTERVAL
+        }
+
+    def _remember(self, image: ImageArray, track: IntArray, points: FloatArray, known: Known) -> None:
+        order = np.argsort(track)
+        track, points = track[order], points[order]
+        known = known.picked(order)
+        new = ~np.isfinite(known.sigma)
+        if (~new).sum() >= _OF_NEAREST:
+            _, near = cKDTree(points[~new]).query(points[new], k=_OF_NEAREST)
+            around = known.inverse_depth[~new][near]
+            known.inverse_depth[new] = np.median(around, axis=1)
+            known.sigma[new] = np.maximum(around.std(axis=1), _NEW_SIGMA[0] * known.inverse_depth[new])
+            known.still[new] = np.clip(np.median(known.still[~new][near], axis=1), *_NEW_STILL[:2])
+        else:
+            known.inverse_depth[new], known.sigma[new], known.still[new] = 1.0, _NEW_SIGMA[1], _NEW_STILL[2]
+        self._views[self._step] = image
+        self._remembered = [*self._remembered, _Remembered(image, track, points, known)][-2:]
 
 
-def _lost_with_neighbors(last: _Remembered, now: _Remembered) -> IntArray:
-    """Return the tracks that were followed in ``last``, and neither they nor most around them in ``now``."""
-    gone = ~now.rows(last.track)[1]
-    if len(gone) <= _NEIGHBORS or gone.sum() < _LEAST_GROUP:
+def _lost_with_neighbors(last: _Remembered, followed: BoolArray, hidden: FloatArray) -> IntArray:
+    """Return the tracks of a frame of which neither they nor most around them are followed any longer.
+
+    Those that were hidden there already, at (n, 2) px, count as neighbors.
+    """
+    if len(followed) <= _NEIGHBORS or followed.all():
         return np.zeros(0, np.int64)
-    lost = np.flatnonzero(gone)
-    _, near = cKDTree(last.points).query(last.points[lost], k=_NEIGHBORS + 1)
-    hidden: IntArray = last.track[lost[gone[near[:, 1:]].mean(axis=1) >= _HIDDEN_PART]]
-    return hidden
+    lost = np.flatnonzero(~followed)
+    gone = np.concatenate((~followed, np.ones(len(hidden), np.bool_)))
+    _, near = cKDTree(np.concatenate((last.points, hidden))).query(last.points[lost], k=_NEIGHBORS + 1)
+    result: IntArray = last.track[lost[gone[near[:, 1:]].mean(axis=1) >= _HIDDEN_PART]]
+    return result
 
 
-def _search(group: _Hidden, now: _Remembered, reach: int, config: TrackingConfig) -> Found:
-    """Look for a group's points in the present image and take those that are found from the group."""
-    nothing = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
-    warp, sigma = group.predict(now)
-    last_pixel = np.array(now.image.shape[::-1]) - 1
-    row = np.flatnonzero(
-        ((warp[:, :2] >= reach) & (warp[:, :2] <= last_pixel - reach)).all(axis=1) & _is_moderate(warp)
-    )
-    if len(row) < _LEAST_GROUP:
+def _search(
+    hidden: _Hidden, views: dict[int, ImageArray], image: ImageArray, config: TrackingConfig
+) -> tuple[IntArray, FloatArray]:
+    """Look for hidden points in the present image: which were found (n,), and where (n, 2) px."""
+    nothing = np.zeros(0, np.int64), np.zeros((0, 2))
+    last_pixel = np.array(image.shape[::-1]) - 1
+    inside = (hidden.points >= config.border_px) & (hidden.points <= last_pixel - config.border_px)
+    row = np.flatnonzero(inside.all(axis=1) & _is_moderate(hidden.affine))
+    if len(row) < _AGREEING:
         return nothing
-    source, warp, sigma = group.points()[row], warp[row], sigma[row]
-    probe = np.linspace(0, len(row) - 1, min(_PROBES, len(row))).astype(np.int64)
-    places = source[probe]
-    offset, correlation = _probe(group.seen.image, now.image, places, warp[probe, :2], sigma[probe], reach)
+    group = hidden.picked(row)
+    offset, correlation = _probe(group, views, image, config.patch_px // 2)
     alike = np.flatnonzero(correlation >= _PROBE_CORRELATION)
-    agreeing = alike[_agree(places[alike], offset[alike])]
-    if len(agreeing) < _AGREEING:
+    agrees = np.zeros(len(row), np.bool_)
+    agrees[alike[_agree(group.picked(alike), offset[alike])]] = True
+    if agrees.sum() < _AGREEING:
         return nothing
-    # What lies among probes that were not found is still hidden.
-    _, nearest = cKDTree(places).query(source, k=_OF_NEAREST)
-    promising = np.isin(nearest, agreeing).any(axis=1)
-    row, source, warp = row[promising], source[promising], warp[promising]
-    _, near = cKDTree(places[agreeing]).query(source, k=_AGREEING)
-    warp[:, :2] += np.median(offset[agreeing][near], axis=1)
-    there, found = _register_both_ways(group.seen.image, now.image, source, warp, config)
-    track = group.track[row[found]]
-    group.track = np.setdiff1d(group.track, track, assume_unique=True)
-    return track, there[found]
+    # What lies among points that were not found is still hidden.
+    _, nearest = cKDTree(group.points).query(group.points, k=min(_OF_NEAREST, len(row)))
+    promising = np.flatnonzero(agrees[nearest].any(axis=1))
+    promising = promising[correlation[promising] >= _LEAST_CORRELATION]
+    agreeing = np.flatnonzero(agrees)
+    _, near = cKDTree(group.points[agreeing]).query(group.points[promising], k=_AGREEING)
+    start = (
+        np.where(agrees[promising, None], offset[promising], np.median(offset[agreeing][near], axis=1))
+        + group.points[promising]
+    )
+    there, found = _register_both_ways(group.picked(promising), views, image, start, config)
+    return row[promising[found]], there[found]
 
 
 def _probe(
-    source: ImageArray, target: ImageArray, at: FloatArray, guess: FloatArray, sigma: FloatArray, reach: int
+    group: _Hidden, views: dict[int, ImageArray], image: ImageArray, reach: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where patches of an image are best found in another: (n, 2) px from the guess, and correlations (n,)."""
-    offset, correlation = np.zeros((len(at), 2)), np.full(len(at), -1.0)
-    radius = np.clip(np.ceil(_SIGMAS * sigma), _LEAST_RADIUS_PX, _LARGEST_RADIUS_PX).astype(np.int64)
-    pixel, center = np.rint(at).astype(np.int64), np.rint(guess).astype(np.int64)
-    first = np.maximum(center - radius[:, None] - reach, 0)
-    end = center + radius[:, None] + reach + 1
-    for n, (column, line) in enumerate(pixel):
-        patch = source[max(line - reach, 0) : line + reach + 1, max(column - reach, 0) : column + reach + 1]
-        window = target[first[n, 1] : end[n, 1], first[n, 0] : end[n, 0]]
-        if patch.shape == (2 * reach + 1, 2 * reach + 1) and min(window.shape) > 2 * reach:
-            _, correlation[n], _, place = cv2.minMaxLoc(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
-            offset[n] = first[n] + reach + np.array(place) + at[n] - pixel[n] - guess[n]
-    return offset, correlation
+    """Return where patches are best found in an image: (n, 2) px from where they should be, and correlations (n,)."""
+    radius = np.clip(np.ceil(_SIGMAS * group.spread()), _LEAST_RADIUS_PX, _LARGEST_RADIUS_PX).astype(np.int64)
+    padding = _LARGEST_RADIUS_PX + reach
+    padded = cv2.copyMakeBorder(image, padding, padding, padding, padding, cv2.BORDER_REPLICATE)
+    patch = _cut(group, views, reach)
+    center = np.rint(group.points).astype(np.int64) + padding
+    offset, correlation = np.zeros((len(center), 2)), np.full(len(center), -1.0)
+    first, end = center - radius - reach, center + radius + reach + 1
+    for n in range(len(center)):
+        window = padded[first[n, 1] : end[n, 1], first[n, 0] : end[n, 0]]
+        _, correlation[n], _, place = cv2.minMaxLoc(cv2.matchTemplate(window, patch[n], cv2.TM_CCOEFF_NORMED))
+        offset[n] = place
+    return offset + center - padding - radius - group.points, correlation
 
 
-def _agree(points: FloatArray, offset: FloatArray) -> BoolArray:
-    """Return which of n points have an offset that others near them have."""
-    if len(points) < _AGREEING:
-        return np.zeros(len(points), np.bool_)
-    _, near = cKDTree(points).query(points, k=min(_OF_NEAREST, len(points)))
-    same = np.linalg.norm(offset[near] - offset[:, None], axis=2) <= _AGREEMENT_PX
-    result: BoolArray = same.sum(axis=1) >= _AGREEING
+def _cut(group: _Hidden, views: dict[int, ImageArray], reach: int) -> ImageArray:
+    """Return what the patches (N, P, P) should look like at present."""
+    side = 2 * reach + 1
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).astype(np.float64)
+    source = group.at[:, :, None] + np.linalg.inv(group.affine) @ np.stack((x, y))
+    result = np.empty((len(group.at), side * side), np.uint8)
+    for view in np.unique(group.view):
+        mine = group.view == view
+        u, v = source[mine].astype(np.float32).transpose(1, 0, 2)
+        result[mine] = cv2.remap(views[int(view)], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return result.reshape(-1, side, side)
+
+
+def _agree(group: _Hidden, offset: FloatArray) -> BoolArray:
+    """Return which of n points have an offset that others near them have, but for what their depth may do to it."""
+    if len(offset) < _AGREEING:
+        return np.zeros(len(offset), np.bool_)
+    _, near = cKDTree(group.points).query(group.points, k=min(_OF_NEAREST, len(offset)))
+    along = group.error[:, :, None] * group.error[:, None, :]
+    covariance = along[near] + along[:, None] + _AGREEMENT_PX**2 * np.eye(2)
+    difference = (offset[near] - offset[:, None])[..., None]
+    squares = (difference * np.linalg.solve(covariance, difference)).sum(axis=(2, 3))
+    result: BoolArray = (squares <= 1.0).sum(axis=1) >= _AGREEING
     return result
 
 
 def _register_both_ways(
-    source: ImageArray, target: ImageArray, at: FloatArray, warp: FloatArray, config: TrackingConfig
-) -> tuple[Float32Array, BoolArray]:
-    """Return where patches around points (n, 2) are found, (n, 2) px, and whether (n,) they lead back."""
-    index = np.arange(len(at))
-    there, correlation = register(cut_templates(source, at.astype(np.float32), config.patch_px), index, target, warp)
-    place = there[:, :2].astype(np.float32)
-    found = (correlation >= _CORRELATION) & (np.linalg.norm(there[:, :2] - warp[:, :2], axis=1) <= _NEAR_PX)
-    found &= _is_moderate(there)
-    ahead = np.flatnonzero(found)
-    inverse = np.linalg.inv(there[ahead, 2:].reshape(-1, 2, 2))
-    start = at[ahead] - np.einsum("nij,nj->ni", inverse, there[ahead, :2] - warp[ahead, :2])
-    back, correlation = register(
-        cut_templates(target, place[ahead], config.patch_px), index[: len(ahead)], source,
-        np.concatenate((start, inverse.reshape(-1, 4)), axis=1),
-    )  # fmt: skip
-    comes_back = np.linalg.norm(back[:, :2] - at[ahead], axis=1) <= config.forward_backward_px
-    found[ahead] = comes_back & (correlation >= _CORRELATION)
+    group: _Hidden, views: dict[int, ImageArray], image: ImageArray, start: FloatArray, config: TrackingConfig
+) -> tuple[FloatArray, BoolArray]:
+    """Return where points are found near (n, 2) px, (n, 2) px, and whether (n,) they lead back."""
+    place, found = start.copy(), np.zeros(len(start), np.bool_)
+    for view in np.unique(group.view):
+        mine = np.flatnonzero(group.view == view)
+        source, at = views[int(view)], group.at[mine]
+        warp = np.concatenate((start[mine], group.affine[mine].reshape(-1, 4)), axis=1)
+        index = np.arange(len(mine))
+        there, correlation = register(cut_templates(source, at.astype(np.float32), config.patch_px), index, image, warp)
+        good = (correlation >= _CORRELATION) & (np.linalg.norm(there[:, :2] - warp[:, :2], axis=1) <= _NEAR_PX)
+        good &= _is_moderate(there[:, 2:].reshape(-1, 2, 2))
+        ahead = np.flatnonzero(good)
+        inverse = np.linalg.inv(there[ahead, 2:].reshape(-1, 2, 2))
+        begin = at[ahead] - np.einsum("nij,nj->ni", inverse, there[ahead, :2] - warp[ahead, :2])
+        back, correlation = register(
+            cut_templates(image, there[ahead, :2].astype(np.float32), config.patch_px), index[: len(ahead)], source,
+            np.concatenate((begin, inverse.reshape(-1, 4)), axis=1),
+        )  # fmt: skip
+        comes_back = np.linalg.norm(back[:, :2] - at[ahead], axis=1) <= config.forward_backward_px
+        found[mine[ahead]] = comes_back & (correlation >= _CORRELATION)
+        place[mine] = there[:, :2]
     return place, found
 
 
-def _is_moderate(warp: FloatArray) -> BoolArray:
-    """Return (N,) where warps (N, 6) neither stretch nor shrink too much; False for NaN."""
-    area = warp[:, 2] * warp[:, 5] - warp[:, 3] * warp[:, 4]
+def _is_moderate(affine: FloatArray) -> BoolArray:
+    """Return (N,) where affine parts (N, 2, 2) neither stretch nor shrink too much."""
+    area = np.linalg.det(affine)
     result: BoolArray = (area >= _LEAST_AREA) & (area <= 1 / _LEAST_AREA)
     return result
