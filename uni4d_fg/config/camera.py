@@ -32,6 +32,13 @@ class CameraConfig(Section):
         0.003, "Part of the reprojection energy that a focal length per frame must take away to be taken.", ge=0, lt=1
     )
     min_zoom: float = setting(0.05, "Part by which the focal length must vary to be taken for a zoom.", gt=0, lt=1)
+    min_zoom_agreement: float = setting(
+        0.6,
+        "Part of the tracks that a zoom must explain better than a camera that does not zoom, to be taken: half say "
+        "nothing, and a thing that moves without a mask speaks for itself alone.",
+        ge=0,
+        le=1,
+    )
     observations: int = setting(20000, "Observations that the lens is found from, at most.", ge=1000)
     zoom_observations: int = setting(60000, "Observations that a zoom is refined on, at most.", ge=1000)
     frames: int = setting(60, "Frames that the lens is found from, at most.", ge=3)

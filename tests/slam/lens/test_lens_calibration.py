@@ -191,6 +191,13 @@ def test_a_lens_needs_energy_distance_and_held_out_tracks(
     assert is_taken(candidate, CameraConfig(), (480, 640)) is taken
 
 
+@pytest.mark.parametrize(("k1", "taken"), [(-0.4, True), (1.4, True), (-1.6, False), (3.5, False)])
+def test_a_distortion_far_from_its_prior_is_no_lens(k1: float, taken: bool) -> None:
+    """Things that move without a mask ask for k1 of 2 to 5 on clips of 8 and 12 tiny frames."""
+    candidate = LensCandidate(Lens("SIMPLE_RADIAL", (k1,)), np.ones(4), 0.03, 0.05, 30.0)
+    assert is_taken(candidate, CameraConfig(), (480, 640)) is taken
+
+
 @pytest.mark.parametrize(
     ("evidence", "held_out_gain", "taken"), [(0.0012, 0.0005, True), (0.0005, 0.0005, False), (0.005, -0.001, False)]
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.errors import ConfigError
+from uni4d_fg.frontend.sequence.frames import no_masks
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel, Tracks
+from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.pipeline import reconstruct
@@ -111,6 +114,27 @@ def test_a_camera_that_does_not_zoom(more: dict[str, object]) -> None:
     assert found.zoom.zoom is None
     assert found.zoom.notes[0].startswith("a focal length per frame would lower the reprojection energy by ")
     np.testing.assert_array_equal(found.intrinsics, sequence.intrinsics)
+
+
+@pytest.mark.parametrize("built_in", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_what_moves_without_a_mask_is_no_zoom(built_in: bool) -> None:
+    """Two things cover 17 % of 8 tiny frames: a focal length per frame explains them at the cost of what stands."""
+    tiny = {"num_frames": 8, "height": 120, "width": 160, "focal": 150.0, "margin_px": 3.0, "query_interval": 6}
+    sequence = scene(**tiny, objects="both", render_images=built_in)
+    sequence = replace(sequence, masks=no_masks(sequence.image_size, sequence.num_frames))
+    settings = config()
+    tracks = load_or_track(sequence, settings.tracking, None) if built_in else sequence.tracks
+    assert tracks is not None
+    given = label_tracks(tracks, sequence, settings.labels, settings.input)
+    found = calibrate_lens(given, sequence.image_size, sequence.intrinsics, settings)
+    assert found.zoom is not None
+    assert found.zoom.evidence > 10 * settings.camera.min_zoom_evidence
+    assert found.zoom.zoom is None
+    assert any("something may move that no mask covers" in warning for warning in found.zoom.warnings)
+    assert found.lens.is_pinhole
+    forced = calibrate_lens(given, sequence.image_size, sequence.intrinsics, config("camera.zoom=on"))
+    assert forced.zoom is not None
+    assert forced.zoom.zoom is not None
 
 
 def test_zoom_that_is_asked_for_or_ruled_out() -> None:

@@ -34,6 +34,9 @@ from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
+_FAR = 3.0
+"""A parameter that is farther from zero than so many sigmas of its prior is no lens: it makes up for what moves."""
+
 
 @dataclass(frozen=True)
 class LensCandidate:
@@ -167,6 +170,8 @@ def is_taken(
     if candidate.evidence < (settings.min_further_evidence if after_another else settings.min_evidence):
         return False
     if not settings.min_displacement_px < candidate.displacement_px < np.inf:
+        return False
+    if max(map(abs, candidate.lens.parameters), default=0.0) > _FAR * settings.parameter_prior_sigma:
         return False
     if after_another or candidate.displacement_px < settings.sure_displacement * max(image_size):
         return candidate.held_out_gain > 0.0

@@ -23,7 +23,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.optim.summary import SolveSummary, Termination
-from uni4d_fg.slam.lens.tracks import ideal_tracks, ideal_weight
+from uni4d_fg.slam.lens.tracks import ideal_tracks, ideal_weight, unzoomed_tracks
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
@@ -49,6 +49,8 @@ class FittedLens:
     """Of part of the tracks, on ideal pixels of the lens."""
     evidence: float = 0.0
     """Part of the reprojection energy that was lost when the model's parameters were set free."""
+    zoom: FloatArray | None = None
+    """(F,) log focal length of each frame over that of the intrinsics, not positive; None where it does not zoom."""
 
     @property
     def intrinsics(self) -> FloatArray:
@@ -215,7 +217,7 @@ class LensFit:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Tracks that no model was fitted to."""
+    """Tracks that models are compared by, each triangulated anew under cameras that are held."""
 
     config: Config
     tracks: LabelledTracks
@@ -225,18 +227,26 @@ class HeldOut:
 
     def gain(self, fit: FittedLens, other: FittedLens) -> float:
         """Return the part by which a fit explains the tracks better than another: of the median track's energy."""
+        ours, theirs = self._both(fit, other)
+        return float(np.median(theirs - ours) / np.median(theirs)) if len(ours) else 0.0
+
+    def better(self, fit: FittedLens, other: FittedLens) -> float:
+        """Return the part of the tracks that a fit explains better than another; half where there are none."""
+        ours, theirs = self._both(fit, other)
+        return float(np.mean(ours < theirs)) if len(ours) else 0.5
+
+    def _both(self, fit: FittedLens, other: FittedLens) -> tuple[FloatArray, FloatArray]:
         ours, theirs = self.energies(fit), self.energies(other)
-        both = np.isfinite(ours) & np.isfinite(theirs)
-        if not both.any():
-            return 0.0
-        return float(np.median(theirs[both] - ours[both]) / np.median(theirs[both]))
+        known = np.isfinite(ours) & np.isfinite(theirs)
+        return ours[known], theirs[known]
 
     def energies(self, fit: FittedLens) -> FloatArray:
         """Triangulate the tracks under frozen cameras; return each one's robust energy per observation, NaN if lost."""
         cameras, ba = fit.scene.cameras, self.config.bundle_adjustment
-        seen = observations_of(
-            ideal_tracks(self.tracks, cameras.intrinsics, fit.lens), TrackLabel.STATIC, TrackLabel.SHORT_STATIC
-        ).with_min_observations(3)
+        ideal = ideal_tracks(self.tracks, cameras.intrinsics, fit.lens)
+        if fit.zoom is not None:
+            ideal = unzoomed_tracks(ideal, cameras.intrinsics, fit.zoom)
+        seen = observations_of(ideal, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(3)
         tracks, row = seen.rows()
         landmarks = mean_per_row(lift(seen, cameras), seen.weight, row, len(tracks))
         known = np.asarray(np.isfinite(landmarks).all(axis=1))
@@ -266,5 +276,9 @@ def _errors(
 ) -> FloatArray:
     """Return the distance, px, of real pixels of observations (N,) from where points (N, 3) appear."""
     x = world_to_camera(fit.scene.cameras.world_T_cam[frame], points)
-    real = fit.lens.real_pixels(fit.intrinsics, np.asarray(project(fit.intrinsics, x)))
+    seen = np.asarray(project(fit.intrinsics, x))
+    if fit.zoom is not None:
+        center = fit.intrinsics[2:]
+        seen = center + np.exp(fit.zoom[frame])[:, None] * (seen - center)
+    real = fit.lens.real_pixels(fit.intrinsics, seen)
     return np.asarray(np.linalg.norm(real - tracks.tracks.uv[track, frame], axis=1))

@@ -5,6 +5,9 @@ reprojection energy would fall; the errors of a tracker reach no fixed part of i
 everything is solved to the end. A lens with distortion asks for a zoom, too, where the camera moves along its view, but
 for itself more. A zoom moves all pixels alike, motion along the view moves near ones more: the two are
 told apart by the relief of the scene and by its depth. The covariance of the solve says how well.
+
+A thing that moves and that no mask covers lets a zoom take away energy, too: its own, at the cost of what stands. A
+zoom that is one explains most tracks better.
 """
 
 from __future__ import annotations
@@ -74,6 +77,12 @@ def find_zoom(work: ZoomFit, scene: StaticScene, num_frames: int, config: Camera
     if config.zoom == "auto" and (found.evidence < config.min_zoom_evidence or span < config.min_zoom):
         note += f" and varies by {100 * span:.1f} % only"
         return ZoomCalibration(None, scene.cameras.intrinsics, found.evidence, _spread(found), (note,), warnings)
+    if config.zoom == "auto":
+        agreement = work.agreement(found, scene)
+        note += f" and explains {100 * agreement:.0f} % of the tracks better"
+        if agreement < config.min_zoom_agreement:
+            warnings = (_ONLY_PART.format(100 * agreement),)
+            return ZoomCalibration(None, scene.cameras.intrinsics, found.evidence, _spread(found), (note,), warnings)
     if not found.focal_sigma <= _FOCAL_OPEN:
         warnings += (_FOCAL_IS_OPEN,)
     focal = found.intrinsics[0] * np.exp(np.interp(np.arange(num_frames), work.frames, found.zoom))
@@ -92,6 +101,11 @@ _OPEN = 0.03
 _FOCAL_OPEN = 0.08
 """Standard deviation of the log focal length of a camera that zooms from which little tells its zoom from motion."""
 _FOCAL_IS_OPEN = "the camera zooms, and tracks hardly determine its focal length: the zoom and the path may be off too"
+
+_ONLY_PART = (
+    "part of the tracks asks for a focal length that changes, and others contradict it (it explains {:.0f} % of them "
+    "better), so none was taken: something may move that no mask covers; give masks, or camera.zoom=on if it zooms"
+)
 
 
 def _spread(fit: FittedZoom) -> float:

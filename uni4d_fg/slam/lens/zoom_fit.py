@@ -10,18 +10,18 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.static_reprojection import static_reprojection
-from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE, ZOOM
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE, ZOOM
 from uni4d_fg.factors.zoom import zoom_smoothness, zoomed_reprojection
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage
-from uni4d_fg.slam.lens.fit import LensFit
+from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit
 from uni4d_fg.slam.lens.tracks import unzoomed_tracks
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import MAP
-from uni4d_fg.slam.stages.scene import StaticScene
+from uni4d_fg.slam.stages.scene import Cameras, StaticScene
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ class FittedZoom:
     """(F,) standard deviation of the zoom relative to the first frame; None where nothing is known of it."""
     focal_sigma: float
     """Standard deviation of the log focal length of the first frame; NaN where nothing is known of it."""
+    cameras: Cameras
+    """Those of the F frames, with the intrinsics above."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ class ZoomFit:
         zoom, intrinsics = start.zoom + left.zoom, left.intrinsics.copy()
         longest = float(zoom.max())
         intrinsics[:2] *= np.exp(longest)
-        return replace(left, zoom=zoom - longest, intrinsics=intrinsics, evidence=start.evidence)
+        cameras = replace(left.cameras, intrinsics=intrinsics)
+        return replace(left, zoom=zoom - longest, intrinsics=intrinsics, evidence=start.evidence, cameras=cameras)
 
     def solve(self, scene: StaticScene, options: Mapping[str, float] | None = None) -> FittedZoom:
         """Solve everything together, from a camera that does not zoom.
@@ -100,7 +103,22 @@ class ZoomFit:
         focal = np.nan if marginals is None else np.sqrt(marginals.blocks(INTRINSICS, 1)[0, 0, 0]) / intrinsics[0]
         longest = float(zoom.max())
         intrinsics[:2] *= np.exp(longest)
-        return FittedZoom(zoom - longest, intrinsics, gain / max(before, 1e-300), sigma, float(focal))
+        cameras = Cameras(state[POSE], intrinsics, state[LOG_SCALE][:, 0])
+        return FittedZoom(zoom - longest, intrinsics, gain / max(before, 1e-300), sigma, float(focal), cameras)
+
+    def agreement(self, found: FittedZoom, scene: StaticScene) -> float:
+        """Return the part of the tracks that a zoom explains better than the camera that does not zoom.
+
+        Args:
+            found: Zoom and cameras.
+            scene: Stages 1 and 2 of a camera that does not zoom.
+
+        Raises:
+            SolverError: If a system is singular.
+        """
+        judge = HeldOut(self.fit.config, self.more_tracks, self.fit.run, self.fit.hooks)
+        zoomed = FittedLens(PINHOLE, replace(scene, cameras=found.cameras), zoom=found.zoom)
+        return judge.better(zoomed, FittedLens(PINHOLE, scene))
 
     def _problem(self, scene: StaticScene) -> tuple[Problem, State]:
         """Return bundle adjustment of a scene with the zoom in place of one focal length."""
