@@ -31,6 +31,20 @@ def test_confidence_falls_where_frames_disagree_and_beside_edges() -> None:
     np.testing.assert_allclose(beside[:, 72:], agreed[:, 72:])
 
 
+def test_where_the_cue_bleeds_depth_that_bends_between_two_surfaces_is_unsure() -> None:
+    """A step of 20 % that is spread over 12 px is unsure at both of its ends; a slanted plane is not."""
+    alone, u = np.full(SHAPE, 0.95, np.float32), np.arange(SHAPE[1], dtype=np.float32)
+    plane = -np.log(0.6 - 0.004 * u) * np.ones((SHAPE[0], 1), np.float32)
+    assert final_confidence(alone, averaged(8, 8, plane), bleeds=True).min() > 0.9
+    spread = np.log(2.0) + 0.2 * np.clip((u - 34) / 12, 0, 1) * np.ones((SHAPE[0], 1), np.float32)
+    before = final_confidence(alone, averaged(8, 8, spread))
+    after = final_confidence(alone, averaged(8, 8, spread), bleeds=True)
+    ends = [34, 46]
+    assert before[:, ends].min() > 0.9
+    assert (after[:, ends] < before[:, ends] - 0.03).all()
+    assert after[:, :30].min() > 0.95
+
+
 @pytest.mark.parametrize(("share", "noise"), [(0.0, 0.003), (0.1, 0.004), (0.2, 0.008)])
 def test_the_error_is_told_from_landmarks_and_confidence(share: float, noise: float, rng: np.random.Generator) -> None:
     """A part of the depth is off by 10 %, and said to be unsure; landmarks lie there three times as often."""

@@ -19,6 +19,12 @@ _LEAST = 0.02
 _MIN_PIXELS = 30
 _FARTHEST_MIXED = 5.0
 """The mixture is wrong nearer to an edge than this, working px; what bleeds farther is right to some percent."""
+_REBLURRED = 0.6
+"""What blurs it once more has this standard deviation, of how far it bleeds ..."""
+_PER_CHANGE = 8.0
+"""... and the cue is off by this many times what that changes, on scenes with truth."""
+_LEAST_RATIO = 0.5
+"""A change by more is none of blurring."""
 _RAMP = 0.12
 """Change of log depth across which a cue that bleeds is a mixture."""
 
@@ -68,6 +74,29 @@ def across_edges(log_cue: Float32Array, radius_px: float) -> BoolArray:
     side = 2 * round(min(radius_px, _FARTHEST_MIXED)) + 1
     window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     return np.asarray(log_range(log_cue, np.asarray(window, np.uint8)) > _RAMP)
+
+
+def mixing_sigma(log_cue: Float32Array, radius_px: float) -> Float32Array:
+    """Return by how much a cue that bleeds is off for it, (h, w): a standard deviation of log depth.
+
+    What blurring did to it shows in what blurring it once more does: planes, whose inverse depth is linear, stay as
+    they are, and edges change as they have changed before.
+
+    Args:
+        log_cue: (h, w), NaN where missing.
+        radius_px: How far it bleeds, working px.
+    """
+    known = np.isfinite(log_cue)
+    if not known.any():
+        return np.zeros_like(log_cue)
+    sigma = _REBLURRED * min(radius_px, _FARTHEST_MIXED)
+    margin = min(int(np.ceil(3 * sigma)), min(log_cue.shape) - 1)
+    inverse = np.exp(-from_nearest(np.where(known, log_cue, np.float32(0)), known))
+    # Continued so that a plane goes on beyond the border.
+    padded = np.pad(inverse, margin, mode="reflect", reflect_type="odd")
+    again = cv2.GaussianBlur(padded, (0, 0), sigma)[margin : -margin or None, margin : -margin or None]
+    change = np.log(np.maximum(again / inverse, _LEAST_RATIO))
+    return np.asarray(_PER_CHANGE * np.sqrt(cv2.GaussianBlur(change**2, (0, 0), sigma)), np.float32)
 
 
 def from_nearest(values: Float32Array, known: BoolArray) -> Float32Array:

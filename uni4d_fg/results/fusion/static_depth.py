@@ -11,7 +11,7 @@ from scipy.special import erf
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.results.fusion.bleeding import across_edges, from_nearest
+from uni4d_fg.results.fusion.bleeding import across_edges, from_nearest, mixing_sigma
 from uni4d_fg.results.fusion.cue_error import CorrectedCue, KnownDepth, correct_cue
 from uni4d_fg.results.fusion.log_range import log_range
 from uni4d_fg.results.fusion.multiview.measured import Measured
@@ -183,6 +183,7 @@ def fuse_static(
     has_cue = np.isfinite(corrected.log_depth)
     mixed = np.zeros(shape, dtype=bool)
     if bleeding_px > 0:
+        cue_sigma = np.hypot(cue_sigma, mixing_sigma(corrected.log_depth, bleeding_px))
         mixed = across_edges(corrected.log_depth, bleeding_px) & ~like_moving
         cue_right = np.where(mixed, np.minimum(cue_right, _MIXED_RIGHT), cue_right)
     seen = measured.log_depth

@@ -1,16 +1,18 @@
 """How sure static depth is once frames are averaged, and how far it is off in the mean, fitted to scenes with truth.
 
 The probability that a pixel is right to 3 % is a logistic function of what its own frame says, of the other frames
-that see it, and of the edges beside it. The mean error is the geometric mean of two estimates that err differently:
-the error that goes with such probabilities on scenes with truth, and how far landmarks are from the depth at pixels as
-sure as theirs. (Landmarks do not see the errors that they share with the depth, those of the cameras. They also lie on
-texture, where depth is best, and beside edges, where it is worst: comparing equally sure pixels takes this out.)
+that see it, of the edges beside it, and where the cue bleeds of how far depth bends. The mean error is the geometric
+mean of two estimates that err differently: the error that goes with such probabilities on scenes with truth, and how
+far landmarks are from the depth at pixels as sure as theirs. (Landmarks do not see the errors that they share with the
+depth, those of the cameras. They also lie on texture, where depth is best, and beside edges, where it is worst:
+comparing equally sure pixels takes this out.)
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
@@ -21,18 +23,24 @@ _WEIGHTS = np.array([-2.2, 0.554, 3.029, 0.499, -2.556], dtype=np.float32)
 _MANY_FRAMES = 4
 _EDGE_WINDOW = np.ones((5, 5), np.uint8)
 _STEEPEST = np.float32(0.3)
+_UNBENT, _BENT_WEIGHT = np.float32(1.0), np.float32(-2.2)
+"""Both fitted; of the constant, 2.3 by the fit, less than half is taken, so that less of the cloud is off."""
+_MOST_BENT = np.float32(0.015)
+"""Relative bend of inverse depth over neighboring pixels from which on depth is as likely between two surfaces."""
+_BESIDE_WINDOW = np.ones((3, 3), np.uint8)
 _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
 _SURE_ERROR, _WRONG_ERROR = 0.0025, 0.08
 """Mean error at a probability of 1, and what a lower one adds per unit."""
 _MIN_COMPARED = 10
 
 
-def final_confidence(alone: Float32Array, averaged: Averaged) -> Float32Array:
+def final_confidence(alone: Float32Array, averaged: Averaged, *, bleeds: bool = False) -> Float32Array:
     """Return the probability (h, w) that depth is right to 3 %; 0 where there is none.
 
     Args:
         alone: (h, w) the same, as the frame alone says.
         averaged: Depth, and what the other frames say of it.
+        bleeds: The cue bleeds across edges: where depth bends, it may lie between two surfaces.
     """
     log_depth = averaged.log_depth
     missing = ~np.isfinite(log_depth)
@@ -42,9 +50,24 @@ def final_confidence(alone: Float32Array, averaged: Averaged) -> Float32Array:
     seen = np.minimum(averaged.seeing, _MANY_FRAMES) / _MANY_FRAMES
     features = np.log(bounded / (1 - bounded)), share, seen, steep
     value = sum((weight * feature for weight, feature in zip(_WEIGHTS[1:], features, strict=True)), _WEIGHTS[0])
+    if bleeds:
+        value = value + _UNBENT + _BENT_WEIGHT * np.minimum(_bend(log_depth) / _MOST_BENT, np.float32(1))
     probability = 1 / (1 + np.exp(-value))
     probability[missing] = 0
     return np.asarray(probability, np.float32)
+
+
+def _bend(log_depth: Float32Array) -> Float32Array:
+    """Return by how much inverse depth departs from a plane between neighboring pixels, of itself, (h, w).
+
+    The inverse depth of a plane is linear. A step between two surfaces that is spread over several pixels is not, at
+    either end of it.
+    """
+    inverse = np.exp(-np.nan_to_num(log_depth, nan=0.0))
+    padded = np.pad(inverse, 1, mode="reflect", reflect_type="odd")
+    across = np.abs(padded[1:-1, 2:] + padded[1:-1, :-2] - 2 * inverse)
+    down = np.abs(padded[2:, 1:-1] + padded[:-2, 1:-1] - 2 * inverse)
+    return np.asarray(cv2.dilate(np.maximum(across, down) / inverse, _BESIDE_WINDOW), np.float32)
 
 
 @dataclass
