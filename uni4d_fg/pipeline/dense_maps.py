@@ -119,6 +119,8 @@ class DenseMaps:
     multiview: MultiviewDepth = field(init=False)
     bleeding_px: float = 0.0
     """How far the cue bleeds across edges, working px."""
+    prefers_matching: bool = False
+    """Whether frames with a sound cue have depth from several views."""
     matched: set[int] = field(default_factory=set)
     """Frames with depth from several views."""
     made: dict[int, _Made] = field(default_factory=dict)
@@ -134,7 +136,7 @@ class DenseMaps:
         )
 
     def try_matching(self) -> None:
-        """Match a few frames to see how far the cue bleeds, and whether landmarks prefer matched depth in any of them.
+        """Match a few frames to see how far the cue bleeds, and whether landmarks prefer matched depth in most of them.
 
         A cue that was made from landmarks is not judged by them: matching counts if it bleeds.
         """
@@ -147,19 +149,20 @@ class DenseMaps:
             if errors.telling and errors.matching > _FAR_WORSE:
                 self.unmatched = _ADDS_NOTHING
                 return
-        tried, bled, untold = list[float](), list[float](), False
+        tried, bled = list[HeldOut](), list[float]()
         for at in evenly_spread(len(sound), _TRIED_FRAMES).tolist():
             measured = self.multiview.at(sound[at])
             judged = self._judged(sound[at], measured)
-            tried.append(judged.errors.matching)
-            untold |= not judged.errors.telling
+            tried.append(judged.errors)
             if measured is not None and self._counts(judged.errors, _NOT_WORSE, bleeds=True):
                 radius = self._bleeding(sound[at], judged, measured)
                 bled += [radius] if np.isfinite(radius) else []
         radius = float(np.median(bled)) if bled else 0.0
         self.bleeding_px = radius if radius > _SHARP_PX else 0.0
-        limit = self._limit()
-        if not (any(error < limit for error in tried) or self.broken or (untold and self.bleeding_px > 0)):
+        # One choice for the whole video: between frames that are matched and others that are not, surfaces would jump.
+        preferred = [self._counts_here(errors) for errors in tried]
+        self.prefers_matching = 2 * sum(preferred) > len(preferred)
+        if not (self.prefers_matching or self.broken):
             self.unmatched = _ADDS_NOTHING
 
     def prepare(self, frames: list[int], mapped: OrderedMap) -> None:
@@ -206,7 +209,7 @@ class DenseMaps:
             self._camera(frame),
             self.config.averaged_sigmas * float(np.clip(mine.depth.sigma, *_AVERAGED_SIGMA)),
         )
-        sure = final_confidence(mine.depth.confidence, averaged)
+        sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
         sure[~mine.unmasked & (mine.depth.matched <= STILL)] = 0
         if frame in self.broken or self.bleeding_px:
             full = np.exp(upsample_guided(averaged.log_depth, self.sequence.images[frame]))
@@ -285,7 +288,7 @@ class DenseMaps:
             measured = self.measured.pop(frame) if frame in self.measured else self.multiview.at(frame)
         judged = self._judged(frame, measured)
         # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
-        if not self._counts(judged.errors, self._limit(), bleeds=self.bleeding_px > 0):
+        if not (self._counts_here(judged.errors) if frame in self.broken else self.prefers_matching):
             measured = None
         if measured is not None:
             self.matched.add(frame)
@@ -331,12 +334,13 @@ class DenseMaps:
 
     @staticmethod
     def _counts(errors: HeldOut, limit: float, *, bleeds: bool) -> bool:
-        """Tell whether matched depth is used in a frame."""
+        """Tell whether matched depth is the better one in a frame."""
         return errors.matching < limit or (bleeds and not errors.telling)
 
-    def _limit(self) -> float:
-        """Return the error of matched depth at landmarks, over that of the cue, below which it is used."""
-        return _NOT_WORSE if self.bleeding_px > 0 else _BETTER
+    def _counts_here(self, errors: HeldOut) -> bool:
+        """Tell whether matched depth is the better one, as far as a frame says; once it is known whether cues bleed."""
+        bleeds = self.bleeding_px > 0
+        return self._counts(errors, _NOT_WORSE if bleeds else _BETTER, bleeds=bleeds)
 
     def _landmark_cues(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where a frame sees landmarks, (N, 2) working px, log depth over the cue, and the log cue (N,)."""
