@@ -129,8 +129,11 @@ def read_bytes(path: Path, limit: int, what: str = "a file") -> bytes:
         raise InputError(f"{path}: has {size} bytes, but {what} has {limit} at most; check that it is the right file")
     try:
         with open(path, "rb") as stream:
-            # One byte more than allowed shows that the file has grown since.
-            data = stream.read(limit + 1)
+            # One byte more than there should be shows that the file has grown since. Asked for as many as are allowed,
+            # Python would map memory for all of them first.
+            data = stream.read(size + 1)
+            if len(data) > size:
+                data += stream.read(limit + 1 - len(data))
     except OSError as error:
         raise read_failure(path, error) from error
     except MemoryError as error:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import Any, TypeVar
@@ -26,6 +27,7 @@ from uni4d_fg.frontend.sequence.bars import bars_note, without_bars
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
+from uni4d_fg.frontend.tracks.io import save_tracks
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.optim.added_factors import FactorSource, fingerprints, with_additions
@@ -53,6 +55,7 @@ from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
 from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, WindowWorkers, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
+from uni4d_fg.pipeline.written_beside import WrittenBeside
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.results import pictures
 from uni4d_fg.results.confidence_store import read_confidence
@@ -80,6 +83,8 @@ class _Run:
     should_stop: Callable[[], bool]
     summary: RunSummary
     recorder: RecordingRunner
+    written: WrittenBeside
+    """What writes the files of finished steps."""
     sources: tuple[FactorSource, ...]
     """What is added to the stages."""
     imu: ImuSamples | None = None
@@ -113,8 +118,8 @@ class _Run:
             record = compute(hooks)
             for kind in kinds_of(name):
                 if kind in self.recorder.solved:
-                    save_stage_graph(self.folder.graph(kind), self.recorder.solved[kind])
-            self.store.save(name, key, record)
+                    self.written.put(partial(save_stage_graph, self.folder.graph(kind), self.recorder.solved[kind]))
+            self.written.put(partial(self.store.save, name, key, record))
             self.reporter.end()
         self._note(name, record.summary, time.perf_counter() - began, resumed)
         return record.arrays
@@ -227,14 +232,12 @@ def _reconstruct(
     on = None
     if windows and not sources:
         on = window_workers(workers, windows, sequence.image_size, run_dir / "stages", config, recorder, should_stop)
-    run = _Run(
-        sequence, config, folder, StageStore(run_dir / "stages"), resume,
-        reporter, should_stop, summary, recorder, sources, imu, workers, on,
-    )  # fmt: skip
-    if on is None:
-        return _solve(run, windows, measured, run_stage)
-    with on:
-        if not resume:
+    with WrittenBeside() as written, on or nullcontext():
+        run = _Run(
+            sequence, config, folder, StageStore(run_dir / "stages"), resume,
+            reporter, should_stop, summary, recorder, written, sources, imu, workers, on,
+        )  # fmt: skip
+        if on is not None and not resume:
             on.start()
         return _solve(run, windows, measured, run_stage)
 
@@ -404,9 +407,12 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
 
     def compute(hooks: Hooks) -> StageRecord:
         cache = run.store.folder
-        tracks = load_or_track(sequence, config.tracking, cache, run.track_progress, run.should_stop)
+        tracks = load_or_track(
+            sequence, config.tracking, cache, run.track_progress, run.should_stop,
+            lambda path, made: run.written.put(partial(save_tracks, path, made)),
+        )  # fmt: skip
         labelled = label_tracks(tracks, sequence, config.labels, config.input)
-        save_labels(run.folder.labels, labelled)
+        run.written.put(partial(save_labels, run.folder.labels, labelled))
         fresh.append(labelled)
         counts = labelled.counts()
         facts = [", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())]
@@ -464,7 +470,9 @@ def _fuse(
         )
         return StageRecord({}, summary)
 
+    run.written.wait()  # depth takes the most space: whether there is any, the small files should say
     run.step("fusion", key, compute, run.sequence.num_frames)
+    run.written.wait()
 
 
 def _readable(read: Callable[[], ValueT], fits: Callable[[ValueT], bool] = lambda _: True) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,6 +45,7 @@ def load_or_track(
     cache_dir: Path | None,
     progress: Progress | None = None,
     should_stop: ShouldStop | None = None,
+    save: Callable[[Path, Tracks], None] = save_tracks,
 ) -> Tracks:
     """Return the tracks of a sequence, tracking only if there is no other way.
 
@@ -53,6 +55,7 @@ def load_or_track(
         cache_dir: Folder of ``tracks-<key>.npz`` files; None remembers nothing. An unreadable file is replaced.
         progress: Told the tracking steps done and to do.
         should_stop: Asked before every step.
+        save: Writes new tracks.
 
     Raises:
         InputError: If the images cannot be tracked, or the sequence's tracks have another length than it.
@@ -70,7 +73,7 @@ def load_or_track(
     if content is not None and content != Content(0, sequence.image_size[0], 0, sequence.image_size[1]):
         # An edge of a bar looks like a point that stands still: the tracker does not see any.
         inner = replace(sequence, images=CroppedFrames(sequence.images, content), content=None)
-        tracks = load_or_track(inner, config, cache_dir, progress, should_stop)
+        tracks = load_or_track(inner, config, cache_dir, progress, should_stop, save)
         return replace(tracks, uv=tracks.uv + np.array([content.left, content.top], np.float32))
     if cache_dir is None:
         return track_grid(sequence.images, config, progress, should_stop)
@@ -79,7 +82,7 @@ def load_or_track(
     if remembered is not None:
         return remembered
     tracks = track_grid(sequence.images, config, progress, should_stop)
-    save_tracks(path, tracks)
+    save(path, tracks)
     return tracks
 
 
