@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from uni4d_fg.cues import mask_flicker
 from uni4d_fg.cues.mask_distance import PackedDistance, overlap, signed_distance
 from uni4d_fg.cues.mask_flicker import may_flicker
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks
@@ -56,6 +57,34 @@ def test_flickering_masks_are_averaged_to_the_truth(rng: np.random.Generator) ->
     assert np.mean(before) < 0.72
     assert np.mean(after) > 0.9
     assert min(after[2:-2]) > 0.8
+
+
+@pytest.mark.parametrize("there", [slice(0, 130), slice(60, 80)])
+def test_in_a_long_video_a_sample_of_frames_tells_first(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, there: slice
+) -> None:
+    """What flickers is found wherever it is, and averaged in all frames; what is sound costs the sample's flow only."""
+    looked: list[int] = []
+
+    def counted(near: object, labels: list[int], frame: int) -> object:
+        looked.append(frame)
+        return averaged(near, labels, frame)
+
+    averaged = mask_flicker._averaged
+    monkeypatch.setattr(mask_flicker, "_averaged", counted)
+    images, truth = clip(rng, [1.0] * FRAMES)
+    walk = np.abs((np.arange(130) + FRAMES) % (2 * FRAMES - 2) - FRAMES + 1)  # there and back
+    images, truth = images[walk], truth[walk]
+    given = np.where(np.isin(np.arange(130), np.arange(130)[there])[:, None, None], flickering(truth, 4), 0)
+    found = repaired(images, given)
+    assert found is not None
+    assert found.instances == [2]
+    shown = range(130)[there][2:-2]
+    assert min(overlap(found[frame] > 0, truth[frame] > 0) for frame in shown) > 0.8
+    looked.clear()
+    growing, grown = clip(rng, [0.93, 1.07] * (FRAMES // 2))
+    assert repaired(growing[walk], grown[walk]) is None
+    assert 0 < len(looked) <= 48
 
 
 def test_another_instance_keeps_its_pixels(rng: np.random.Generator) -> None:

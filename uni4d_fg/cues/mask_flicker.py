@@ -7,12 +7,12 @@ for their normal noise are not touched.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, Int32Array
+from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, Int32Array, evenly_spread
 from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray
 from uni4d_fg.cues.mask_distance import PackedDistance, carried_distance, overlap, shrunk_mask, signed_distance
 from uni4d_fg.frontend.sequence.model import FrameSource
@@ -31,6 +31,8 @@ _REACH = 2
 """Frames before and after that are averaged."""
 _TOGETHER = 8
 """Frames of each thread that are held at a time."""
+_SAMPLE = 48
+"""Frames of an instance that are looked at before all are: flow is dear, and most masks are sound."""
 _OVERLAP = 0.4
 """Intersection over union of a mask with one that is carried over: where it is less, flow has failed."""
 
@@ -47,14 +49,15 @@ def may_flicker(area: FloatArray) -> bool:
 
 
 def averaged_masks(
-    images: FrameSource[ImageArray], masks: FrameSource[Int32Array], labels: list[int], size: tuple[int, int]
-) -> dict[int, dict[int, PackedDistance]]:
+    images: FrameSource[ImageArray], masks: FrameSource[Int32Array], areas: Mapping[int, FloatArray],
+    size: tuple[int, int],
+) -> dict[int, dict[int, PackedDistance]]:  # fmt: skip
     """Return what is averaged of those of some instances that flicker.
 
     Args:
         images: T images (H, W, 3), RGB.
         masks: T label maps (H, W).
-        labels: Instances to look at.
+        areas: Of the instances to look at, (T,), working px.
         size: Working size.
 
     Returns:
@@ -64,24 +67,52 @@ def averaged_masks(
     Raises:
         InputError: If a frame or mask cannot be read.
     """
+    labels, sample = list(areas), _sampled(areas)
+    if 2 * len(sample) < len(masks):
+        _, ways = _averages(images, masks, labels, size, sample)
+        labels = [label for label in labels if _flickers(ways[label])]
+    averages, ways = _averages(images, masks, labels, size, range(len(masks)) if labels else ())
+    return {label: averages[label] for label in labels if _flickers(ways[label])}
+
+
+def _sampled(areas: Mapping[int, FloatArray]) -> list[int]:
+    """Return frames, ascending, with up to :data:`_SAMPLE` of those in which each instance is there."""
+    frames: set[int] = set()
+    for area in areas.values():
+        there = np.flatnonzero(area >= _LEAST_PX)
+        frames.update(there[evenly_spread(len(there), _SAMPLE)].tolist())
+    return sorted(frames)
+
+
+def _averages(
+    images: FrameSource[ImageArray], masks: FrameSource[Int32Array], labels: list[int], size: tuple[int, int],
+    frames: Sequence[int],
+) -> tuple[dict[int, dict[int, PackedDistance]], dict[int, list[tuple[float, float]]]]:  # fmt: skip
+    """Return by instance what :func:`_averaged` finds in some frames, ascending: distances by frame, and ways."""
     averages: dict[int, dict[int, PackedDistance]] = {label: {} for label in labels}
     ways: dict[int, list[tuple[float, float]]] = {label: [] for label in labels}
     near: dict[int, tuple[ImageArray, Int32Array]] = {}
     threads = thread_count()
-    for first in range(0, len(masks), _TOGETHER * threads):
-        frames = range(first, min(first + _TOGETHER * threads, len(masks)))
-        wanted = range(max(first - _REACH, 0), min(frames.stop + _REACH, len(masks)))
+    for first in range(0, len(frames), _TOGETHER * threads):
+        together = list(frames[first : first + _TOGETHER * threads])
+        wanted = sorted(
+            {
+                beside
+                for frame in together
+                for beside in range(max(frame - _REACH, 0), min(frame + _REACH + 1, len(masks)))
+            }
+        )
         near = {
             number: near.get(number) or (shrunk_gray(images[number], size), shrunk_mask(masks[number], size))
             for number in wanted
         }
         for frame, found in zip(
-            frames, map_in_order(partial(_averaged, near, labels), list(frames), threads), strict=True
+            together, map_in_order(partial(_averaged, near, labels), together, threads), strict=True
         ):
             for label, (mean, way) in found.items():
                 averages[label][frame] = mean
                 ways[label] += way
-    return {label: averages[label] for label, way in ways.items() if _flickers(way)}
+    return averages, ways
 
 
 def _averaged(

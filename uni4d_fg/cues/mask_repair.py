@@ -139,7 +139,7 @@ def repair_masks(
     areas = instance_areas(masks, size)
     made = _made_masks(images, masks, areas, size)
     whole = RepairedMasks(masks, made) if made else masks
-    suspects = sorted(label for label, area in areas.items() if may_flicker(area))
+    suspects = {label: area for label, area in sorted(areas.items()) if may_flicker(area)}
     averaged = averaged_masks(images, whole, suspects, size) if suspects else {}
     return RepairedMasks(masks, made, averaged) if made or averaged else None
 
