@@ -98,11 +98,11 @@ def orthonormalize(transform: FloatArray) -> FloatArray:
 
 
 def adjoint(transform: FloatArray) -> FloatArray:
-    """Return Ad (6, 6) of a rigid transform: ``T Exp(xi) = Exp(Ad xi) T``, rotation first."""
-    out = np.zeros((6, 6))
-    rotation, center = transform[:3, :3], transform[:3, 3]
-    out[:3, :3] = out[3:, 3:] = rotation
-    out[3:, :3] = skew(center) @ rotation
+    """Return Ad (..., 6, 6) of rigid transforms (..., 4, 4): ``T Exp(xi) = Exp(Ad xi) T``, rotation first."""
+    out = np.zeros((*transform.shape[:-2], 6, 6))
+    rotation, center = transform[..., :3, :3], transform[..., :3, 3]
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    out[..., 3:, :3] = skew(center) @ rotation
     return out
 
 

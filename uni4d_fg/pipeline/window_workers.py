@@ -17,7 +17,7 @@ from uni4d_fg.optim.runners import stage_runner
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.stage_graph import RecordingRunner, StageGraph
 from uni4d_fg.optim.threads import thread_count
-from uni4d_fg.pipeline.window_tasks import STOPPED
+from uni4d_fg.pipeline.window_tasks import STOPPED, MadeItems
 from uni4d_fg.pipeline.workers.cluster import open_workers
 from uni4d_fg.pipeline.workers.memory import free_bytes, reconstruction_bytes, worker_count
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -143,23 +143,35 @@ class WindowWorkers:
         """
         if not items:
             return
+        last_of: dict[str, int] = {}
+        """Of every kind of solve, the last item that has one."""
+        for index, outcome in self._outcomes(_Calls(function, items, self.config, {len(items) - 1})):
+            for kind in outcome.kinds:
+                last_of[kind] = max(index, last_of.get(kind, index))
+            self.recorder.solved.update(outcome.graphs)
+            yield index, outcome.result
+        # Graphs are large, and only the last item is sure to be needed for its own. Seldom, it lacks a kind.
+        earlier = sorted(set(last_of.values()) - {len(items) - 1})
+        again = MadeItems(earlier, items.__getitem__)
+        for number, outcome in self._outcomes(_Calls(function, again, self.config, set(range(len(again))))):
+            own = {kind: graph for kind, graph in outcome.graphs.items() if last_of[kind] == earlier[number]}
+            self.recorder.solved.update(own)
+
+    def _outcomes(self, calls: _Calls) -> Iterator[tuple[int, _Outcome]]:
+        """Yield what came of each call. Raises as :meth:`__call__`."""
+        if not calls:
+            return
         self.start()
         assert self._client is not None
         client = self._client.result()
-        calls = _Calls(function, items, self.config)
-        traces = [self.folder / f"window_{index}.hang.txt" for index in range(len(items))]
-        came_from: dict[str, int] = {}
+        traces = [self.folder / f"window_{index}.hang.txt" for index in range(len(calls))]
         try:
-            found = spread(client, _call, calls, self.options, traces, self.should_stop)
-            for index, outcome in found:
+            for index, outcome in spread(client, _call, calls, self.options, traces, self.should_stop):
                 if isinstance(outcome, Lost):
                     raise SolverError(f"a window cannot be solved on the workers: {outcome.why}")
                 if outcome.error is not None:
                     raise outcome.error
-                for kind, graph in outcome.graphs.items():
-                    if index >= came_from.get(kind, -1):
-                        came_from[kind], self.recorder.solved[kind] = index, graph
-                yield index, outcome.result
+                yield index, outcome
         except Cancelled as error:
             raise Cancelled(STOPPED) from error
 
@@ -171,6 +183,7 @@ class _Call:
     function: Callable[..., Any]
     item: Any
     config: Config
+    with_graphs: bool
 
 
 @dataclass(frozen=True)
@@ -179,26 +192,32 @@ class _Outcome:
 
     result: Any = None
     error: Uni4dFgError | None = None
+    kinds: tuple[str, ...] = ()
+    """Of its solves."""
     graphs: dict[str, StageGraph] = field(default_factory=dict)
+    """Of these, where they are asked for."""
 
 
 class _Calls(Sequence[_Call]):
     """The calls of some items, each made when it is given out."""
 
-    def __init__(self, function: Callable[..., Any], items: Sequence[Any], config: Config) -> None:
-        self.function, self.items, self.config = function, items, config
+    def __init__(
+        self, function: Callable[..., Any], items: Sequence[Any], config: Config, with_graphs: set[int]
+    ) -> None:
+        self.function, self.items, self.config, self.with_graphs = function, items, config, with_graphs
 
     def __len__(self) -> int:
         return len(self.items)
 
     def __getitem__(self, index: Any) -> Any:
-        return _Call(self.function, self.items[index], self.config)
+        return _Call(self.function, self.items[index], self.config, index in self.with_graphs)
 
 
 def _call(call: _Call) -> _Outcome:
     """Solve one window, in a worker; what goes wrong with it is an answer, for the process is sound."""
     recorder = RecordingRunner(stage_runner(call.config))
     try:
-        return _Outcome(call.function(call.item, recorder, Hooks()), graphs=recorder.solved)
+        result = call.function(call.item, recorder, Hooks())
     except Uni4dFgError as error:
         return _Outcome(error=error)
+    return _Outcome(result, None, tuple(recorder.solved), recorder.solved if call.with_graphs else {})

@@ -100,8 +100,8 @@ def join(
         gradient, matrices = np.zeros(len(free)), []
         for part in information:
             d, jacobian = part.difference(cameras)
-            matrices.append(jacobian.T @ part.hessian @ jacobian)
-            gradient[part.columns(num_frames)] += jacobian.T @ (part.hessian @ d + part.gradient)
+            matrices.append(jacobian.congruent(part.hessian))
+            gradient[part.columns(num_frames)] += jacobian.left_product((part.hessian @ d + part.gradient)[None])[0]
         entries: list[Entries] = []
         if added is not None:
             slope, entries = added.linearize(cameras)

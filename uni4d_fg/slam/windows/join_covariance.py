@@ -16,7 +16,7 @@ from uni4d_fg.optim.few_clusters import blend
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.added_terms import AddedTerms
 from uni4d_fg.slam.windows.fronts import sandwich_blocks, stepped_chain
-from uni4d_fg.slam.windows.information import FRAME, SHARED, WindowInformation
+from uni4d_fg.slam.windows.information import FRAME, SHARED, WindowInformation, WindowJacobian
 
 
 def joined_covariances(
@@ -40,12 +40,12 @@ def joined_covariances(
     """
     num_frames = len(cameras.world_T_cam)
     jacobians = [part.difference(cameras)[1] for part in information]
-    curvatures = [j.T @ part.curvature @ j for part, j in zip(information, jacobians, strict=True)]
+    curvatures = [j.congruent(part.curvature) for part, j in zip(information, jacobians, strict=True)]
     curvatures[0][-4:, -4:] += known
     scores = _scores(information, jacobians, num_frames, len(free))
     rests = []
     for part, j in zip(information, jacobians, strict=True):
-        rests.append(np.zeros_like(part.curvature) if part.spread is None else j.T @ part.spread.rest @ j)
+        rests.append(np.zeros_like(part.curvature) if part.spread is None else j.congruent(part.spread.rest))
     rests[0][-4:, -4:] += known
 
     windows, entries = [part.window for part in information], [] if added is None else added.linearize(cameras)[1]
@@ -72,7 +72,7 @@ class _Marginals(NamedTuple):
 
 
 def _scores(
-    information: list[WindowInformation], jacobians: list[FloatArray], num_frames: int, size: int
+    information: list[WindowInformation], jacobians: list[WindowJacobian], num_frames: int, size: int
 ) -> FloatArray | None:
     """Return one row (G, size) per cluster of landmarks; None where errors count as independent."""
     spreads = [part.spread for part in information if part.spread is not None]
@@ -80,6 +80,6 @@ def _scores(
         return None
     scores = np.zeros((max(len(spread.scores) for spread in spreads), size))
     for part, spread, j in zip(information, spreads, jacobians, strict=True):
-        scores[: len(spread.scores), part.columns(num_frames)] += spread.scores @ j
+        scores[: len(spread.scores), part.columns(num_frames)] += j.left_product(spread.scores)
     used = int(np.any(scores != 0.0, axis=1).sum())
     return np.sqrt(used / (used - 1.0)) * scores if used >= MIN_CLUSTERS else None
