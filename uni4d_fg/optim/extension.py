@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from uni4d_fg import factors
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.errors import MissingDependencyError
 from uni4d_fg.factors.batch import FactorBatch
@@ -86,7 +88,11 @@ def batch_energy(batch: FactorBatch, state: State) -> float:
 
 
 def has_kernel(batch: FactorBatch) -> bool:
-    """Return whether the extension has a kernel of the batch's factor type: of its name, data and dimensions."""
+    """Return whether the extension has a kernel of the batch's factor type: of its name, data and dimensions.
+
+    Raises:
+        SolverError: If it has one for a type of this package that was declared elsewhere under the same name.
+    """
     declared = batch.factor_type
     core, _ = find_extension()
     if core is None or not declared.listed or declared.name not in _kernels(core):
@@ -103,7 +109,13 @@ def has_kernel(batch: FactorBatch) -> bool:
 
 @cache
 def _kernels(core: Any) -> dict[str, Any]:
-    """Return what the extension declares of its kernels, by name."""
+    """Return what the extension declares of its kernels, by name.
+
+    A kernel knows its type by name alone. With all types of this package declared, one of somebody's own that has the
+    same name and data, but another residual, is an error instead of a wrong result.
+    """
+    for module in pkgutil.iter_modules(factors.__path__, f"{factors.__name__}."):
+        importlib.import_module(module.name)
     return dict(core.factor_types())
 
 
