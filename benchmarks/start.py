@@ -5,7 +5,7 @@
 
 Neither intrinsics nor depth nor masks are given. Columns: focal length as a part of the longer image side and the
 interval that is reported for it; camera path against that of the unchanged video after Sim(3), as a part of its extent
-(RMS), and turns per frame; the same against the truth, where there is one; CPU seconds of the start; warnings.
+(RMS), and turns per frame; the same against the truth, where there is one; frames posed; CPU seconds; warnings.
 ``--masks`` takes the cameras that follow when what moves was found; without it, those from all tracks.
 ``--incremental`` adds pycolmap's incremental mapper (SIFT, the masks found where ``--masks``), one row per clip.
 """
@@ -123,6 +123,7 @@ def incremental(video: Video, masks: list[ImageArray] | None) -> Cameras | None:
     """Return what pycolmap's incremental mapper finds."""
     import pycolmap
 
+    pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for part in ("images", "masks"):
@@ -181,8 +182,9 @@ def main() -> None:
     parser.add_argument("--incremental", action="store_true")
     options = parser.parse_args()
     config = load_config("default", [])
-    print("| clip | change | focal length | interval | path | deg/frame | path, truth | deg/frame | s | warnings |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    columns = "clip, change, focal length, interval, path, deg/frame, to truth: path, deg/frame, frames, s, warnings"
+    print(f"| {columns.replace(', ', ' | ')} |")
+    print(f"|{'---|' * len(columns.split(', '))}")
     for name, video, truth in clips(options.clips, options.synthetic):
         first: Cameras | None = None
         for change in options.changes:
@@ -205,7 +207,7 @@ def row(name: str, change: str, found: Cameras, first: Cameras, truth: FloatArra
     low, high = found.interval
     print(
         f"| {name} | {change} | {found.focal:.4f} | {low:.4f} to {high:.4f} "
-        f"| {difference(found, first.frame, first.world_T_cam)} | {against} | {found.seconds:.1f} "
+        f"| {difference(found, first.frame, first.world_T_cam)} | {against} | {len(found.frame)} | {found.seconds:.1f} "
         f"| {'; '.join(found.warnings)} |",
         flush=True,
     )
