@@ -267,6 +267,8 @@ def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
 
 def _compresses(array: npt.NDArray[Any]) -> bool:
     """Return whether compression is worth its time, as a part from the middle says: noise in floating point is not."""
+    if array.dtype.kind == "U":
+        return True  # four bytes per character; and a text may be one element, larger than the part
     part = array.reshape(-1)[array.size // 2 :][: _SAMPLE_BYTES // max(array.itemsize, 1)].tobytes()
     return len(zlib.compress(part, 1)) < _WORTH_COMPRESSING * len(part) or array.nbytes < _SAMPLE_BYTES
 

@@ -146,6 +146,14 @@ def test_npz_refuses_what_it_should(tmp_path: Path) -> None:
     assert not (tmp_path / "b.npz").exists()
 
 
+@pytest.mark.parametrize("letters", [100, 8191, 8192, 100_000])
+def test_a_text_of_any_length_is_compressed(tmp_path: Path, letters: int) -> None:
+    text = "a summary; " * (letters // 11 + 1)
+    save_npz(tmp_path / "a.npz", summary=np.array(text[:letters]))
+    assert (tmp_path / "a.npz").stat().st_size < 1200 + 0.05 * letters
+    assert str(load_npz(tmp_path / "a.npz", {"summary": None})["summary"]) == text[:letters]
+
+
 def test_objects_are_never_unpickled(tmp_path: Path) -> None:
     objects = np.array([{"a": 1}], dtype=object)
     np.savez(tmp_path / "a.npz", uv=objects)
