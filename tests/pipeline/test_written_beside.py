@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import pytest
+from pipeline_scenes import TINY, make_config, make_scene, run_sound
 
 from uni4d_fg.errors import OutputError
+from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.written_beside import WrittenBeside
+from uni4d_fg.results.run_folder import RunFolder
 
 
 def test_they_are_written_in_order_while_the_caller_goes_on() -> None:
@@ -62,3 +66,24 @@ def test_an_interrupted_run_still_has_its_files() -> None:
     with pytest.raises(KeyboardInterrupt):
         run()
     assert done == [0]
+
+
+def test_graphs_whose_record_comes_late_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save, begun = StageStore.save, threading.Event()
+    discard = StageStore.discard
+
+    def save_late(store: StageStore, name: str, key: str, record: StageRecord) -> None:
+        if name == "camera_init":
+            assert begun.wait(60)
+        save(store, name, key, record)
+
+    def removed(store: StageStore, name: str) -> None:
+        discard(store, name)
+        if name == "nonrigid":  # bundle adjustment, which may leave graphs of the first stage too, is through by now
+            begun.set()
+
+    monkeypatch.setattr(StageStore, "save", save_late)
+    monkeypatch.setattr(StageStore, "discard", removed)
+    run_sound(make_scene(TINY, num_frames=4), tmp_path, make_config("bundle_adjustment.measure_noise=false"))
+    for kind in ("camera_init", "bundle_adjustment", "nonrigid"):
+        assert RunFolder(tmp_path).graph(kind).exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from uni4d_fg.files import atomic_write_text, remove_file
@@ -23,16 +24,22 @@ def kinds_of(step: str) -> tuple[str, ...]:
     return _KINDS.get(step, ())
 
 
-def remove_graphs(folder: RunFolder, step: str) -> None:
+def remove_graphs(folder: RunFolder, step: str, done: Iterable[str] = ()) -> None:
     """Remove the graphs that an earlier run of a step left.
+
+    Args:
+        folder: The run.
+        step: The step that is about to begin.
+        done: Steps that this run is through with, whose graphs are kept. What is on disk does not tell: their files
+            may still be on the way.
 
     Raises:
         OutputError: If one cannot be removed.
     """
-    kinds = kinds_of(step)
-    if step == "bundle_adjustment" and (folder.root / "stages" / "camera_init.npz").exists():
-        kinds = kinds[1:]
-    for kind in kinds:
+    kept = {kind for other in done for kind in kinds_of(other)}
+    for kind in kinds_of(step):
+        if kind in kept:
+            continue
         for path in (folder.graph(kind), *(folder.graphs / f"{kind}.{end}.values" for end in ("initial", "final"))):
             remove_file(path)
 

@@ -105,7 +105,7 @@ class _Run:
             self._check_cancelled()
             # A step may write files besides its record: an old record must not vouch for half-new ones.
             self.store.discard(name)
-            remove_graphs(self.folder, name)
+            remove_graphs(self.folder, name, done=self.summary.stages)
             self.recorder.solved.clear()
             self.reporter.begin(name.replace("_", " "), total)
             counter = iter(range(1, 1 << 30))
