@@ -5,8 +5,10 @@
 A run is made of the walls of a room and a ball that moves through it; `uni4d-fg view` shows it, and chromium (by
 playwright, with software rendering) opens it. The time to the first picture counts from the start of the command to
 the first frame in which points are drawn. Frames are counted where the page draws clouds (`window.uni4dDetail`) while
-the mouse turns the view, after two seconds in which the page learns how much it can draw. The time of a switch is that
-from a key press to the panel telling the next frame, which comes in one message with the picture.
+the mouse turns the view, at a frame that has trails, after two seconds in which the page learns how much it can draw.
+The time of a switch is that from a key press to the panel telling the next frame, which it does when the picture has
+been given to the browser to draw; and, in a second series, to the end of its drawing, when its pixels can be read. The
+next key is pressed at once.
 """
 
 from __future__ import annotations
@@ -118,13 +120,29 @@ def turning_rate(page: Any, seconds: float) -> tuple[float, float]:
     return (frames - counted[1]) / (time.perf_counter() - counted[0]), float(np.mean(drawn))
 
 
-_SWITCH = """async () => {
+_SWITCH = """async (drawn) => {
   const text = () => Number(/frame (\\d+) of/.exec(document.body.textContent)?.[1]);
-  const before = text(), began = performance.now();
-  document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", code: "ArrowRight", bubbles: true }));
+  const key = (kind) => document.body.dispatchEvent(
+    new KeyboardEvent(kind, { key: "ArrowRight", code: "ArrowRight", bubbles: true }));
+  const canvas = [...document.querySelectorAll("canvas")].sort((one, other) => other.width - one.width)[0];
+  const gl = canvas.getContext("webgl2"), before = text(), began = performance.now();
+  key("keydown");
+  key("keyup");
   while (text() === before && performance.now() - began < 5000) await new Promise((go) => setTimeout(go, 1));
+  if (drawn) gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   return performance.now() - began;
 }"""
+FRAMES_WITH_TRAILS = 12
+SWITCHES = 15
+
+
+def switch_times(page: Any, count: int, *, drawn: bool) -> np.ndarray:
+    """Go on by so many frames; milliseconds of each, to the text or to the end of the drawing."""
+    before = page.evaluate("window.uni4dDetail.frames")
+    times = np.array([page.evaluate(_SWITCH, drawn) for _ in range(count)])
+    page.evaluate("new Promise((go) => requestAnimationFrame(() => requestAnimationFrame(go)))")
+    assert page.evaluate("window.uni4dDetail.frames") - before >= count, "a switch drew no picture"
+    return times
 
 
 def main() -> None:
@@ -159,10 +177,14 @@ def main() -> None:
                 if time.perf_counter() - began > 120.0:
                     break
             print(f"all there: {time.perf_counter() - began:.0f} s, {wanted:.0f} points to see", flush=True)
-            rate, drawn = turning_rate(page, arguments.seconds)
-            print(f"turning: {rate:.1f} frames a second, {drawn:.0f} points in each", flush=True)
-            times = sorted(page.evaluate(_SWITCH) for _ in range(15))
-            print(f"switch of frame: median {times[7]:.0f} ms, worst {times[-1]:.0f} ms", flush=True)
+            switch_times(page, FRAMES_WITH_TRAILS, drawn=True)
+            rate, points = turning_rate(page, arguments.seconds)
+            print(f"turning: {rate:.1f} frames a second, {points:.0f} points in each", flush=True)
+            for what, drawn in (("", False), (", to the end of its drawing", True)):
+                times = switch_times(page, SWITCHES, drawn=drawn)
+                print(
+                    f"switch of frame{what}: median {np.median(times):.0f} ms, worst {times.max():.0f} ms", flush=True
+                )
         finally:
             process.terminate()
             process.wait()

@@ -29,10 +29,15 @@ const places = { scale: place("scale"), view: place("modelViewMatrix"), projecti
 const view = new Float32Array([1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,-5,1]), projection = new Float32Array(16).fill(0);
 projection[0] = projection[5] = 1;
 const tick = () => { for (const go of frames.splice(0)) go(now); };
+// What viser shows to its own tests: what came from the server, and how a picture is asked for.
+const viser = { messageQueue: [], requestRender() {} };
+const listened = () => { window.__viserMutable = viser; tick(); };
+const message = (...types) => { viser.messageQueue.push(...types.map((type) => ({ type }))); viser.requestRender(); };
 // Draw a cloud of 1.6 million points of a pixel each, milliseconds after the picture before; return what was drawn.
 function picture(after = 0) {
   if (after) { now += after; tick(); }
   spent = BASE; sizes = [];
+  if (viser.messageQueue.splice(0).length) viser.requestRender();
   context.useProgram(program);
   context.uniformMatrix4fv(places.view, false, view);
   context.uniformMatrix4fv(places.projection, false, projection);
@@ -45,6 +50,7 @@ function picture(after = 0) {
   return { drawn: window.uni4dDetail.drawn, ms: Math.max(spent, 16), size: Math.max(...sizes) };
 }
 const turn = (count) => { let last; for (let k = 0; k < count; k++) last = picture(); return last; };
+const drawing = (go) => { const before = window.uni4dDetail.frames; go(); return window.uni4dDetail.frames - before; };
 </script>"""
 
 GPU = "NVIDIA,2,1e-6,1e-6"
@@ -130,3 +136,66 @@ def test_pictures_that_would_be_the_same_are_left_out_by_software_until_somethin
         page.keyboard.press("ArrowRight")
         page.evaluate("picture(5)")
         assert page.evaluate("window.uni4dDetail.frames") == before + 1
+
+
+SWITCH = 'message("SetSceneNodeVisibilityMessage", "SetSceneNodeVisibilityMessage", "GuiUpdateMessage")'
+
+
+def listening_stage(page: Any, renderer: str, learn: int = 80) -> None:
+    stage(page, renderer)
+    page.evaluate(f"turn({learn}); listened(); picture(); picture(400)")
+
+
+def test_a_switch_is_one_picture_by_software_and_the_full_one_follows() -> None:
+    with browser_page() as page:
+        listening_stage(page, SLOW_SOFTWARE)
+        for _ in range(3):
+            page.evaluate(f"{SWITCH}; picture()")
+            moving = page.evaluate("window.uni4dDetail.drawn")
+            assert moving == pytest.approx(6000, rel=0.02)
+            assert page.evaluate("window.uni4dDetail.moving") is True
+            # viser draws for a quarter of a second, and once a second.
+            assert page.evaluate("drawing(() => turn(16))") == 0
+            assert page.evaluate("drawing(() => picture(400))") == 0
+            still = [page.evaluate("picture(1000)")["drawn"] for _ in range(3)]
+            assert still[0] > 6 * moving
+            assert still == sorted(still)
+            assert still[-1] >= 20 * moving
+            assert page.evaluate("window.uni4dDetail.moving") is False
+
+
+def test_a_key_waits_for_no_picture_that_would_be_the_same() -> None:
+    with browser_page() as page:
+        listening_stage(page, SLOW_SOFTWARE)
+        page.evaluate(f"{SWITCH}; turn(2)")
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate("drawing(() => turn(5))") == 0
+        assert page.evaluate(f"drawing(() => {{ {SWITCH}; turn(5); }})") == 1
+
+
+def test_what_may_take_several_pictures_gets_them() -> None:
+    def drawn(then: str) -> int:
+        listening_stage(page, SLOW_SOFTWARE)
+        return int(page.evaluate(f"drawing(() => {{ {then}; turn(5); }})"))
+
+    with browser_page() as page:
+        assert drawn(SWITCH) == 1
+        assert drawn('message("SetSceneNodeVisibilityMessage", "SceneNodeUpdateMessage")') == 5
+        # Without a message: what viser moves by itself, like the camera.
+        assert drawn("viser.requestRender()") == 5
+        # A cloud that comes a picture late, as no one said.
+        assert drawn(f"{SWITCH}; turn(3); context.drawArrays(context.POINTS, 0, 10); tick()") == 2
+        page.evaluate("now += 1000")
+        page.mouse.move(10, 10)
+        page.mouse.down()
+        page.mouse.move(20, 20)
+        assert page.evaluate("drawing(() => turn(5))") == 5
+
+
+def test_no_picture_is_left_out_before_it_is_known_how_long_they_take_nor_by_a_graphics_card() -> None:
+    with browser_page() as page:
+        listening_stage(page, SLOW_SOFTWARE, learn=1)
+        assert page.evaluate(f"drawing(() => {{ {SWITCH}; turn(5); }})") == 5
+        listening_stage(page, GPU)
+        assert page.evaluate(f"drawing(() => {{ {SWITCH}; turn(5); }})") == 5
+        assert page.evaluate("window.uni4dDetail.drawn") == pytest.approx(ALL)

@@ -9,6 +9,12 @@
       const slides = target.getAttribute("role") === "slider" && event.key.startsWith("Arrow");
       if (slides || (target.tagName === "BUTTON" && event.code === "Space")) event.stopPropagation();
     });
+    // The arrows that go by a frame would also turn the view for as long as they are held: viser's commands hear of a key
+    // at the root, its camera at the document, which is asked last. A page to send has no commands.
+    document.documentElement.addEventListener("keydown", (event) => {
+      const steps = event.key === "ArrowLeft" || event.key === "ArrowRight";
+      if (steps && !window.__VISER_EMBED_DATA__) event.stopPropagation();
+    });
     // A check box that was clicked would keep the arrow keys to itself.
     document.body.addEventListener("click", (event) => {
       if (event.detail > 0 && event.target.type === "checkbox") event.target.blur();

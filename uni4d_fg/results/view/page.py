@@ -7,17 +7,17 @@ from importlib.resources import files
 from typing import Any
 
 _BEGIN = "<head>"
+_SCRIPTS = ("software.js", "detail.js", "page.js")
+"""In this order: what detail.js counts as drawn is what viser asks for, not what software.js makes of it."""
 
 
 def with_scripts(page: str) -> str:
-    """Return an HTML page in whose head the scripts for level of detail, keys and phones come first.
+    """Return an HTML page in whose head the scripts for lines, level of detail, keys and phones come first.
 
     Nothing of a run is in them. A page without a head is returned as it is.
     """
     folder = files("uni4d_fg.results.view")
-    scripts = "".join(
-        f"<script>{(folder / name).read_text(encoding='utf-8')}</script>" for name in ("detail.js", "page.js")
-    )
+    scripts = "".join(f"<script>{(folder / name).read_text(encoding='utf-8')}</script>" for name in _SCRIPTS)
     return page.replace(_BEGIN, _BEGIN + scripts, 1)
 
 
