@@ -255,12 +255,14 @@ def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
             raise ValueError(f"{path}: {name!r} is an object array and cannot be saved without pickle")
     with (
         atomic_path(path) as temporary,
-        # At level 3 measurements end 4 % larger than at the usual 6, in a third of the time.
-        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=3) as archive,
+        zipfile.ZipFile(temporary, "w") as archive,
     ):
         for name, array in plain.items():
             entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED if _compresses(array) else zipfile.ZIP_STORED
+            # At level 3 measurements end 4 % larger than at the usual 6, in a third of the time. An entry that is given
+            # its date does not take the archive's level.
+            entry._compresslevel = 3  # type: ignore[attr-defined] # public from Python 3.13 on, under another name
             with archive.open(entry, "w", force_zip64=True) as stream:
                 np.lib.format.write_array(stream, array, allow_pickle=False)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import zipfile
+import zlib
 from enum import Enum
 from pathlib import Path
 
@@ -126,6 +127,20 @@ def test_npz_round_trip(tmp_path: Path) -> None:
     assert set(load_npz(path, {"flag": 1}, {"scalar": 0, "absent": 2})) == {"flag", "scalar"}
     with np.load(path, allow_pickle=False) as archive:
         assert str(archive["name"]) == "kitchen"
+
+
+def test_arrays_are_compressed_at_level_three(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    save_npz(path, values=np.random.default_rng(0).integers(0, 50, 100_000).astype(np.int32))
+    with zipfile.ZipFile(path) as archive:
+        (entry,) = archive.infolist()
+        data = archive.read(entry)
+    sizes = []
+    for level in (3, 6):
+        packer = zlib.compressobj(level, zlib.DEFLATED, -15)
+        sizes.append(len(packer.compress(data)) + len(packer.flush()))
+    assert entry.date_time == (1980, 1, 1, 0, 0, 0)
+    assert abs(entry.compress_size - sizes[0]) < 0.1 * abs(sizes[1] - sizes[0])
 
 
 def test_npz_refuses_what_it_should(tmp_path: Path) -> None:
