@@ -127,6 +127,20 @@ def test_views_that_fit_badly_are_taken_out_and_posed_again() -> None:
     np.testing.assert_allclose(scene.world_T_cam[[9, 17]], right[[9, 17]], atol=0.01)
 
 
+def test_judging_what_has_changed_is_judging_all() -> None:
+    scene = scene_of(tracked(sideways(FRAMES), 5))
+    assert scene.start(FramePair(4, 12, 30.0, 200)) > 50
+    for _ in range(4):
+        frame = scene.next_frame(set())
+        assert frame is not None
+        assert scene.register(frame)
+        good, position = scene.good.copy(), scene.position.copy()
+        scene._judge()
+        np.testing.assert_array_equal(scene.good, good)
+        np.testing.assert_array_equal(scene.position, position)
+    assert np.count_nonzero(scene.good) > 1000
+
+
 def test_what_is_held_out_leaves_both_ends_of_every_track() -> None:
     observations = tracked(sideways(FRAMES), 6, points=60).observations
     out = held_out(observations, 4)

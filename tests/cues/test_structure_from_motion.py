@@ -74,7 +74,7 @@ def bundle(points: np.ndarray, poses: np.ndarray, uv: np.ndarray) -> RayBundle:
     """All points in all views: uv (views, points, 2)."""
     views, count = uv.shape[:2]
     row = np.tile(np.arange(count), views)
-    return RayBundle(row, np.repeat(poses, count, axis=0), uv.reshape(-1, 2), K, count)
+    return RayBundle(row, poses, np.repeat(np.arange(views), count), uv.reshape(-1, 2), K, count)
 
 
 @settings(max_examples=20, deadline=None)
@@ -107,9 +107,29 @@ def test_parallel_rays_and_points_behind_are_no_points() -> None:
     # Track 0 is seen twice from one place, track 1 by rays that part in front and meet behind.
     row = np.array([0, 0, 1, 1])
     uv = np.array([[100.0, 100.0], [100.0, 100.0], [150.0, 100.0], [200.0, 100.0]])
-    found = triangulate(RayBundle(row, poses[[0, 2, 0, 1]], uv, K, 2), 1.0)
+    found = triangulate(RayBundle(row, poses, np.array([0, 2, 0, 1]), uv, K, 2), 1.0)
     assert np.isnan(found.position[0]).all()
     assert not sound(found, 3.0, 1.0).any()
+
+
+def test_points_come_out_alike_together_and_alone(rng: np.random.Generator) -> None:
+    poses = np.stack([np.eye(4), moved((0.0, 0.05, 0.0), (0.2, 0.0, 0.0)), moved((0.02, 0.0, 0.0), (0.0, 0.2, 0.1))])
+    points, _, _ = views(rng, poses[1], 40)
+    uv = np.stack([project(K, world_to_camera(pose, points)) for pose in poses]) + rng.normal(0, 0.5, (3, 40, 2))
+    uv[2, :4] += 40.0  # outliers, of which Huber's kernel makes less
+    rays = bundle(points, poses, uv)
+    found = triangulate(rays, 1.0)
+    alone = np.arange(3) * 40 + 7
+    single = RayBundle(np.zeros(3, np.int64), poses, rays.frame[alone], rays.uv[alone], K, 1)
+    np.testing.assert_allclose(triangulate(single, 1.0).position[0], found.position[7], rtol=1e-12)
+    again = np.arange(40) < 4
+    replaced = found.replaced(again, triangulate(rays.select(np.repeat([True, True, False], 40)), 1.0))
+    np.testing.assert_array_equal(replaced.position[4:], found.position[4:])
+    distance = np.linalg.norm(replaced.position[:4] - points[:4], axis=1)
+    assert (distance < np.linalg.norm(found.position[:4] - points[:4], axis=1)).all()
+    none = triangulate(rays.select(np.zeros(120, dtype=bool)), 1.0)
+    assert np.isnan(none.position).all()
+    assert np.isnan(none.angle).all()
 
 
 def test_picked_tracks_cover_every_frame_and_both_sides(rng: np.random.Generator) -> None:

@@ -20,7 +20,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
 from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.geometry import se3
-from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
+from uni4d_fg.geometry.camera import NEAR_PLANE, project, seen_from
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.stage import Stage, run_stage
@@ -118,7 +118,7 @@ class GrowingScene:
         missing = ~np.isfinite(self.position[:, 0])
         visible = np.zeros(self.num_tracks, dtype=bool)
         visible[self.row[self.observations.frame == frame]] = True
-        self.triangulate(missing & visible)
+        self.triangulate(missing & visible, posed=frame)
         return True
 
     def take_out(self, frames: IntArray) -> None:
@@ -132,15 +132,20 @@ class GrowingScene:
         self.intrinsics = other.intrinsics.copy()
         self.triangulate(np.ones(self.num_tracks, dtype=bool))
 
-    def triangulate(self, which: BoolArray) -> None:
-        """Triangulate tracks (M,) from the frames that have a pose; what does not fit stays without a point."""
+    def triangulate(self, which: BoolArray, posed: int | None = None) -> None:
+        """Triangulate tracks (M,) from the frames that have a pose; what does not fit stays without a point.
+
+        Args:
+            which: (M,) tracks.
+            posed: The only frame whose pose has changed since all was judged last; None judges all anew.
+        """
         settings = self.config.geometric_depth
         used = np.flatnonzero(which[self.row] & self.registered[self.observations.frame])
         rows, local = np.unique(self.row[used], return_inverse=True)
         points = triangulate(self._rays(used, local, len(rows)), settings.triangulation_huber_px)
         fits = sound(points, settings.max_reprojection_px, settings.min_angle_deg)
         self.position[rows] = np.where(fits[:, None], points.position, np.nan)
-        self._judge()
+        self._judge(None if posed is None else np.flatnonzero(which[self.row] | (self.observations.frame == posed)))
 
     def adjust(self, relative_decrease: float | None = None) -> None:
         """Refine all cameras, points and (from three frames on) the focal lengths; then judge all observations.
@@ -219,19 +224,31 @@ class GrowingScene:
         self.sigma_px = float(np.clip(sigma, settings.min_reprojection_sigma_px, settings.reprojection_sigma_px))
         return sigma
 
-    def errors(self) -> FloatArray:
-        """Return the reprojection error of every observation, (N,) px; infinite without a point or behind."""
-        x = world_to_camera(self.world_T_cam[self.observations.frame], self.position[self.row])
+    def errors(self, some: IntArray | None = None) -> FloatArray:
+        """Return the reprojection error of every observation, (N,) px; infinite without a point or behind.
+
+        Args:
+            some: Those to look at (n,), None for all; the result has as many.
+        """
+        observations, row = self.observations, self.row
+        frame, uv = observations.frame, observations.uv
+        if some is not None:
+            frame, uv, row = frame[some], uv[some], row[some]
+        x = seen_from(self.world_T_cam, frame, self.position[row])
         with np.errstate(invalid="ignore"):
-            error = np.linalg.norm(self.observations.uv - project(self.intrinsics, x), axis=1)
+            off = uv - project(self.intrinsics, x)
+            error = np.hypot(off[:, 0], off[:, 1])
             usable = np.isfinite(error) & (x[:, 2] > NEAR_PLANE)
         result: FloatArray = np.where(usable, error, np.inf)
         return result
 
-    def _judge(self) -> None:
-        self.good = self.registered[self.observations.frame] & (
-            self.errors() <= self.config.geometric_depth.max_reprojection_px
-        )
+    def _judge(self, changed: IntArray | None = None) -> None:
+        """Tell which observations agree with their point, of all or of those (n,) for which it may have changed."""
+        limit = self.config.geometric_depth.max_reprojection_px
+        if changed is None:
+            self.good = self.registered[self.observations.frame] & (self.errors() <= limit)
+        else:
+            self.good[changed] = self.registered[self.observations.frame[changed]] & (self.errors(changed) <= limit)
         # A point that fewer than two observations hold is none.
         held = np.bincount(self.row[self.good], minlength=self.num_tracks) >= 2
         self.position[~held] = np.nan
@@ -246,7 +263,8 @@ class GrowingScene:
     def _rays(self, used: IntArray, local: IntArray, count: int) -> RayBundle:
         return RayBundle(
             local.astype(np.int64),
-            self.world_T_cam[self.observations.frame[used]],
+            self.world_T_cam,
+            self.observations.frame[used],
             self.observations.uv[used],
             self.intrinsics,
             count,

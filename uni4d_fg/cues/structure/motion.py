@@ -60,6 +60,7 @@ def structure_from_motion(
     config: Config,
     reporter: Reporter,
     should_stop: Callable[[], bool],
+    with_doubts: bool = True,
 ) -> Structure | None:
     """Find cameras and static points from tracks.
 
@@ -71,6 +72,7 @@ def structure_from_motion(
         config: Sections ``geometric_depth``, ``bundle_adjustment`` and ``input``.
         reporter: Told the steps, and the number of frames that have a pose.
         should_stop: Polled before every frame.
+        with_doubts: Also look for what the tracks leave open; else there is one focal length and no rival.
 
     Returns:
         The structure, or None if no two frames have enough parallax to see depth.
@@ -104,12 +106,14 @@ def structure_from_motion(
     sigma = scene.measure_noise()
     poses = _bridge(scene.world_T_cam, scene.registered)
     track, points = _triangulate_all(observations, poses, scene)
-    rivals = rivals_of(hypotheses, poses)
-    focal = focal_interval(scene, image_size)
-    if free_focal:
-        usual = np.array(settings.usual_focal) * max(image_size)
-        others = [rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]]
-        focal = focal.holding(others)
+    mean_focal = float(np.mean(scene.intrinsics[:2]))
+    rivals, focal = list[Rival](), FocalInterval(mean_focal, mean_focal)
+    if with_doubts:
+        rivals = rivals_of(hypotheses, poses)
+        focal = focal_interval(scene, image_size)
+        if free_focal:
+            usual = np.array(settings.usual_focal) * max(image_size)
+            focal = focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
     reporter.end()
     return Structure(
         poses, scene.intrinsics, scene.registered, track, points, sigma, best.pair, focal, best.unexplained, rivals
@@ -147,8 +151,12 @@ def _triangulate_all(observations: Observations, poses: FloatArray, scene: Growi
     tracks, row = observations.rows()
     settings = scene.config.geometric_depth
     limit, huber_px = settings.max_reprojection_px, settings.triangulation_huber_px
-    rays = RayBundle(row, poses[observations.frame], observations.uv, scene.intrinsics, len(tracks))
-    points = triangulate(rays.select(triangulate(rays, huber_px).errors_of(rays) <= limit), huber_px)
+    rays = RayBundle(row, poses, observations.frame, observations.uv, scene.intrinsics, len(tracks))
+    points = triangulate(rays, huber_px)
+    with np.errstate(invalid="ignore"):
+        fits = points.errors_of(rays) <= limit
+    again = np.bincount(row, ~fits, len(tracks)) > 0
+    points = points.replaced(again, triangulate(rays.select(fits & again[row]), huber_px))
     with np.errstate(invalid="ignore"):
         wrong = ~(points.error_px <= limit)
     points.position[wrong] = np.nan

@@ -15,9 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, sum_rows
-from uni4d_fg.factors.projection import chain_to_world_point, projection_derivatives
-from uni4d_fg.geometry.camera import NEAR_PLANE, project, unproject, world_to_camera
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.geometry.camera import (
+    NEAR_PLANE,
+    inverse_depth,
+    inverse_depth_slope,
+    project,
+    seen_from,
+    world_to_camera,
+)
 
 _STEPS = 8
 _RIDGE = 1e-9
@@ -28,12 +34,14 @@ _CONVERGED = 1e-5
 
 @dataclass(frozen=True)
 class RayBundle:
-    """N rays, each of one of M tracks."""
+    """N rays, each of one of M tracks, from T cameras."""
 
     row: IntArray
     """(N,) track of each ray, 0 .. M - 1."""
     world_T_cam: FloatArray
-    """(N, 4, 4) camera of each ray."""
+    """(T, 4, 4)."""
+    frame: IntArray
+    """(N,) camera of each ray, 0 .. T - 1."""
     uv: FloatArray
     """(N, 2) px."""
     intrinsics: FloatArray
@@ -43,7 +51,7 @@ class RayBundle:
 
     def select(self, keep: BoolArray) -> RayBundle:
         """Return the rays with ``keep`` (N,), of the same M tracks."""
-        return RayBundle(self.row[keep], self.world_T_cam[keep], self.uv[keep], self.intrinsics, self.count)
+        return RayBundle(self.row[keep], self.world_T_cam, self.frame[keep], self.uv[keep], self.intrinsics, self.count)
 
 
 @dataclass(frozen=True)
@@ -59,10 +67,19 @@ class Points:
     error_px: FloatArray
     """(M,) median reprojection error."""
 
+    def replaced(self, which: BoolArray, other: Points) -> Points:
+        """Return these points, but those with ``which`` (M,) of another M points."""
+        return Points(
+            np.where(which[:, None], other.position, self.position),
+            np.where(which[:, None, None], other.information, self.information),
+            np.where(which, other.angle, self.angle),
+            np.where(which, other.error_px, self.error_px),
+        )
+
     def errors_of(self, rays: RayBundle) -> FloatArray:
         """Return the reprojection error (N,) px of rays to these points; NaN without a point."""
-        error: FloatArray = np.linalg.norm(_residual(rays, self.position), axis=1)
-        return error
+        off = rays.uv - project(rays.intrinsics, seen_from(rays.world_T_cam, rays.frame, self.position[rays.row]))
+        return np.asarray(np.hypot(off[:, 0], off[:, 1]))
 
 
 def triangulate(rays: RayBundle, huber_px: float) -> Points:
@@ -72,23 +89,18 @@ def triangulate(rays: RayBundle, huber_px: float) -> Points:
         rays: What the frames see.
         huber_px: Reprojection errors above this count less, px.
     """
-    center = rays.world_T_cam[:, :3, 3]
-    in_camera: FloatArray = unproject(rays.intrinsics, rays.uv, np.ones(len(rays.uv)))
-    direction = np.einsum("nij,nj->ni", rays.world_T_cam[:, :3, :3], in_camera)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    matrix = sum_rows(across, rays.row, rays.count)
-    right = sum_rows(np.einsum("nij,nj->ni", across, center), rays.row, rays.count)
+    matrix, right = _nearest_to_all(rays)
     # Parallel rays leave one direction open: the smallest eigenvalue is about (angle)^2 / 2.
     solvable = np.linalg.eigvalsh(matrix)[:, 0] > _RIDGE
     position = np.full((rays.count, 3), np.nan)
     position[solvable] = np.linalg.solve(matrix[solvable], right[solvable][..., None])[..., 0]
     position, information = _refine(rays, position, huber_px)
-    z = world_to_camera(rays.world_T_cam, position[rays.row])[:, 2]
+    x = seen_from(rays.world_T_cam, rays.frame, position[rays.row])
     with np.errstate(invalid="ignore"):
-        behind = np.bincount(rays.row, ~(z > NEAR_PLANE), rays.count) > 0
+        behind = np.bincount(rays.row, ~(x[:, 2] > NEAR_PLANE), rays.count) > 0
     position[behind] = np.nan
-    error = np.linalg.norm(_residual(rays, position), axis=1)
+    off = rays.uv - project(rays.intrinsics, x)
+    error = np.where(behind[rays.row], np.nan, np.hypot(off[:, 0], off[:, 1]))
     return Points(position, information, ray_angles(rays, position), median_per_row(error, rays.row, rays.count))
 
 
@@ -105,13 +117,16 @@ def ray_angles(rays: RayBundle, position: FloatArray) -> FloatArray:
 
     The angle between the first camera and the one farthest from it in angle: at least half of the largest.
     """
-    to_camera = rays.world_T_cam[:, :3, 3] - position[rays.row]
-    to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
+    if len(rays.row) == 0:
+        return np.full(rays.count, np.nan)
+    away = [rays.world_T_cam[:, a, 3][rays.frame] - position[:, a][rays.row] for a in range(3)]
     order = np.argsort(rays.row, kind="stable")
     start = np.searchsorted(rays.row[order], np.arange(rays.count))
-    first = to_camera[order[np.minimum(start, max(len(order) - 1, 0))]]
-    cross = np.linalg.norm(np.cross(first[rays.row], to_camera), axis=1)
-    angle = np.arctan2(cross, np.sum(first[rays.row] * to_camera, axis=1))
+    first = order[np.minimum(start, len(order) - 1)][rays.row]
+    x, y, z = away
+    u, v, w = (part[first] for part in away)
+    across = (v * z - w * y) ** 2 + (w * x - u * z) ** 2 + (u * y - v * x) ** 2
+    angle = np.arctan2(np.sqrt(across), u * x + v * y + w * z)
     out = np.full(rays.count, -np.inf)
     seen = np.isfinite(angle)
     np.maximum.at(out, rays.row[seen], angle[seen])
@@ -132,7 +147,7 @@ def inverse_depth_sigma(
     """
     z = world_to_camera(world_T_cam, position)[:, 2]
     axis = world_T_cam[:3, 2]
-    along = np.linalg.solve(_padded(information), np.broadcast_to(axis, position.shape)[..., None])[..., 0]
+    along = _solved(_padded(information), np.broadcast_to(axis, position.shape))
     variance = along @ axis
     result: FloatArray = sigma_px * np.sqrt(np.maximum(variance, 0.0)) / np.maximum(z, NEAR_PLANE) ** 2
     return result
@@ -148,61 +163,127 @@ def median_per_row(values: FloatArray, row: IntArray, count: int) -> FloatArray:
     return result
 
 
+def _nearest_to_all(rays: RayBundle) -> tuple[FloatArray, FloatArray]:
+    """Return the normal equations (M, 3, 3) and (M, 3) of the point nearest to all rays of each track."""
+    x, y = (rays.uv - rays.intrinsics[2:]).T / rays.intrinsics[:2, None]
+    rotation = rays.world_T_cam[:, :3, :3]
+    direction = [
+        rotation[:, a, 0][rays.frame] * x + rotation[:, a, 1][rays.frame] * y + rotation[:, a, 2][rays.frame]
+        for a in range(3)
+    ]
+    length = np.sqrt(sum(part * part for part in direction))
+    direction = [part / length for part in direction]
+    center = [rays.world_T_cam[:, a, 3][rays.frame] for a in range(3)]
+    along = sum(d * c for d, c in zip(direction, center, strict=True))
+    matrix, right = np.empty((rays.count, 3, 3)), np.empty((rays.count, 3))
+    for a in range(3):
+        right[:, a] = np.bincount(rays.row, center[a] - direction[a] * along, rays.count)
+        for b in range(a + 1):
+            across = float(a == b) - direction[a] * direction[b]
+            matrix[:, a, b] = matrix[:, b, a] = np.bincount(rays.row, across, rays.count)
+    return matrix, right
+
+
 def _refine(rays: RayBundle, position: FloatArray, huber_px: float) -> tuple[FloatArray, FloatArray]:
     """Lower the robust reprojection error of every point; return positions and information (M, 3, 3)."""
     position = position.copy()
     information = np.zeros((rays.count, 3, 3))
-    moving: BoolArray = np.asarray(np.isfinite(position).all(axis=1))
+    tracks = np.flatnonzero(np.isfinite(position).all(axis=1))
+    views = _Views.of(rays, tracks)
     for _ in range(_STEPS):
-        tracks = np.flatnonzero(moving)
         if len(tracks) == 0:
             break
-        used = moving[rays.row]
-        row = np.searchsorted(tracks, rays.row[used])
-        poses = rays.world_T_cam[used]
-        x = world_to_camera(poses, position[tracks][row])
-        by_x, _ = projection_derivatives(np.broadcast_to(rays.intrinsics, (len(x), 4)), x)
-        jacobian = chain_to_world_point(by_x, poses)
-        residual = rays.uv[used] - project(rays.intrinsics, x)
-        weight = 1.0 / np.maximum(np.linalg.norm(residual, axis=1) / huber_px, 1.0)
-        hessian, gradient = _normal_equations(jacobian, residual, weight, row, len(tracks))
-        step = np.linalg.solve(_padded(hessian), gradient[..., None])[..., 0]
+        hessian, gradient, nearest = views.normal_equations(position[tracks], huber_px)
+        step = _solved(_padded(hessian), gradient)
         # A step longer than the distance to the cameras leads nowhere.
-        nearest = np.full(len(tracks), np.inf)
-        np.minimum.at(nearest, row, np.linalg.norm(x, axis=1))
         length = np.linalg.norm(step, axis=1)
         step *= np.minimum(1.0, 0.5 * nearest / np.maximum(length, 1e-12))[:, None]
         position[tracks] += step
         information[tracks] = hessian
-        moving[tracks[length < _CONVERGED * nearest]] = False
+        moving: BoolArray = ~(length < _CONVERGED * nearest)
+        if not moving.all():
+            tracks, views = tracks[moving], views.of_tracks(moving)
     return position, information
 
 
-def _normal_equations(
-    jacobian: FloatArray, residual: FloatArray, weight: FloatArray, row: IntArray, count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return J'WJ (count, 3, 3) and J'Wr (count, 3), summed over the observations of each row.
+@dataclass(frozen=True)
+class _Views:
+    """What n rays of m tracks see, written out by columns: many tiny matrices cost NumPy several times their work."""
 
-    Written out by columns: products of many tiny matrices cost numpy several times their arithmetic.
-    """
-    hessian, gradient = np.empty((count, 3, 3)), np.empty((count, 3))
-    u, v = np.ascontiguousarray(jacobian.transpose(1, 2, 0))
-    for a in range(3):
-        weighted_u, weighted_v = weight * u[a], weight * v[a]
-        gradient[:, a] = np.bincount(row, weighted_u * residual[:, 0] + weighted_v * residual[:, 1], count)
-        for b in range(a + 1):
-            hessian[:, a, b] = hessian[:, b, a] = np.bincount(row, weighted_u * u[b] + weighted_v * v[b], count)
-    return hessian, gradient
+    row: IntArray
+    """(n,) track of each ray, 0 .. m - 1."""
+    columns: FloatArray
+    """(14, n): the rotation into the camera, row by row, the world's origin in its axes, and the pixel."""
+    intrinsics: FloatArray
+    """(4,) px."""
+    count: int
+    """m."""
+
+    @classmethod
+    def of(cls, rays: RayBundle, tracks: IntArray) -> _Views:
+        """Return the rays of some tracks (m,), ascending."""
+        local = np.full(rays.count, -1, dtype=np.int64)
+        local[tracks] = np.arange(len(tracks))
+        used = np.flatnonzero(local[rays.row] >= 0)
+        frame = rays.frame[used]
+        rotation = rays.world_T_cam[:, :3, :3].swapaxes(1, 2)
+        origin = -(rotation @ rays.world_T_cam[:, :3, 3:])[:, :, 0]
+        columns = np.empty((14, len(used)))
+        for k in range(9):
+            columns[k] = rotation[:, k // 3, k % 3][frame]
+        for k in range(3):
+            columns[9 + k] = origin[:, k][frame]
+        columns[12:] = rays.uv[used].T
+        return cls(local[rays.row[used]], columns, rays.intrinsics, len(tracks))
+
+    def of_tracks(self, keep: BoolArray) -> _Views:
+        """Return the rays of the tracks with ``keep`` (m,)."""
+        used = keep[self.row]
+        row = (np.cumsum(keep, dtype=np.int64) - 1)[self.row[used]]
+        return _Views(row, self.columns[:, used], self.intrinsics, int(np.count_nonzero(keep)))
+
+    def normal_equations(self, position: FloatArray, huber_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return J'WJ (m, 3, 3), J'Wr (m, 3) and the distance (m,) of points (m, 3) from their nearest camera."""
+        fx, fy, cx, cy = self.intrinsics
+        px, py, pz = (position[:, a][self.row] for a in range(3))
+        r = self.columns
+        x, y, z = (r[3 * i] * px + r[3 * i + 1] * py + r[3 * i + 2] * pz + r[9 + i] for i in range(3))
+        nearest = np.full(self.count, np.inf)
+        np.minimum.at(nearest, self.row, x * x + y * y + z * z)
+        g, slope = inverse_depth(z), inverse_depth_slope(z)
+        off_u, off_v = r[12] - (fx * x * g + cx), r[13] - (fy * y * g + cy)
+        weight = 1.0 / np.maximum(np.hypot(off_u, off_v) / huber_px, 1.0)
+        along_u, along_v = fx * x * slope, fy * y * slope
+        by_u = [fx * g * r[a] + along_u * r[6 + a] for a in range(3)]
+        by_v = [fy * g * r[3 + a] + along_v * r[6 + a] for a in range(3)]
+        hessian, gradient = np.empty((self.count, 3, 3)), np.empty((self.count, 3))
+        for a in range(3):
+            weighted_u, weighted_v = weight * by_u[a], weight * by_v[a]
+            gradient[:, a] = np.bincount(self.row, weighted_u * off_u + weighted_v * off_v, self.count)
+            for b in range(a + 1):
+                term = weighted_u * by_u[b] + weighted_v * by_v[b]
+                hessian[:, a, b] = hessian[:, b, a] = np.bincount(self.row, term, self.count)
+        return hessian, gradient, np.sqrt(nearest)
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve positive definite systems (m, 3, 3), (m, 3) by the factors L D L', all at once."""
+    d0 = matrix[:, 0, 0]
+    l10, l20 = matrix[:, 1, 0] / d0, matrix[:, 2, 0] / d0
+    d1 = matrix[:, 1, 1] - l10 * matrix[:, 1, 0]
+    l21 = (matrix[:, 2, 1] - l20 * matrix[:, 1, 0]) / d1
+    d2 = matrix[:, 2, 2] - l20 * matrix[:, 2, 0] - l21 * l21 * d1
+    y1 = right[:, 1] - l10 * right[:, 0]
+    y2 = right[:, 2] - l20 * right[:, 0] - l21 * y1
+    z = y2 / d2
+    y = y1 / d1 - l21 * z
+    x = right[:, 0] / d0 - l10 * y - l20 * z
+    result: FloatArray = np.stack((x, y, z), axis=1)
+    return result
 
 
 def _padded(information: FloatArray) -> FloatArray:
     """Return (M, 3, 3) matrices made safe to invert."""
     trace = np.trace(information, axis1=1, axis2=2)
     result: FloatArray = information + (_RIDGE * trace + 1e-12)[:, None, None] * np.eye(3)
-    return result
-
-
-def _residual(rays: RayBundle, position: FloatArray) -> FloatArray:
-    x = world_to_camera(rays.world_T_cam, position[rays.row])
-    result: FloatArray = rays.uv - project(rays.intrinsics, x)
     return result

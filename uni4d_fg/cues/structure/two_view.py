@@ -57,18 +57,8 @@ def fit_rotation(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatA
         uv_second: (N, 2) px.
         intrinsics: (4,) px.
     """
-    a, b = _rays(uv_first, intrinsics), _rays(uv_second, intrinsics)
-    weight = np.ones(len(a))
-    distance = np.full(len(a), np.inf)
-    rotation = np.eye(3)
-    for _ in range(_REWEIGHTINGS):
-        u, _, vt = np.linalg.svd((b * weight[:, None]).T @ a)
-        rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-        moved = a @ rotation.T
-        distance = np.linalg.norm(project(intrinsics, moved) - uv_second, axis=1)
-        scale = max(float(np.median(distance)), 1e-3)
-        weight = 1.0 / np.maximum(distance / scale, 1.0)
-    return RotationFit(rotation, float(np.median(distance)))
+    rotation, left = _fit_rotations(uv_first, uv_second, intrinsics[None])
+    return RotationFit(rotation[0], float(left[0]))
 
 
 def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, *, known_focal: bool) -> float:
@@ -81,8 +71,31 @@ def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray
         known_focal: Whether the focal lengths are exact.
     """
     factors = np.ones(1) if known_focal else _FOCAL_FACTORS
-    scaled = [intrinsics * np.array([factor, factor, 1.0, 1.0]) for factor in factors]
-    return min(fit_rotation(uv_first, uv_second, k).residual_px for k in scaled)
+    scale = np.ones((len(factors), 4))
+    scale[:, :2] = factors[:, None]
+    return float(_fit_rotations(uv_first, uv_second, intrinsics * scale)[1].min())
+
+
+def _fit_rotations(
+    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Fit a rotation to N pixel pairs (N, 2) for each of F intrinsics (F, 4), all at once.
+
+    Returns:
+        Rotations (F, 3, 3) of the second camera seen from the first, and the median distance (F,) px that each leaves.
+    """
+    a, b = _rays(uv_first, intrinsics), _rays(uv_second, intrinsics)
+    weight = np.ones(a.shape[:2])
+    rotation, left = np.tile(np.eye(3), (len(a), 1, 1)), np.full(len(a), np.inf)
+    for _ in range(_REWEIGHTINGS):
+        u, _, vt = np.linalg.svd((b * weight[..., None]).swapaxes(1, 2) @ a)
+        u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+        rotation = u @ vt
+        off = project(intrinsics[:, None], a @ rotation.swapaxes(1, 2)) - uv_second
+        distance = np.hypot(off[..., 0], off[..., 1])
+        left = np.median(distance, axis=1)
+        weight = 1.0 / np.maximum(distance / np.maximum(left, 1e-3)[:, None], 1.0)
+    return rotation, left
 
 
 def relative_pose(
@@ -119,6 +132,7 @@ def relative_pose(
 
 
 def _rays(uv: FloatArray, intrinsics: FloatArray) -> FloatArray:
-    rays: FloatArray = unproject(intrinsics, uv, np.ones(len(uv)))
-    unit: FloatArray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    """Return unit rays (F, N, 3) of pixels (N, 2) for intrinsics (F, 4)."""
+    rays: FloatArray = unproject(intrinsics[:, None], uv[None], np.ones(len(uv)))
+    unit: FloatArray = rays / np.linalg.norm(rays, axis=2, keepdims=True)
     return unit
