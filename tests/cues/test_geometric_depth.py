@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import LinearNDInterpolator
 
 from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
@@ -15,12 +16,13 @@ from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion, settings_for_geometry
 from uni4d_fg.cues.interpolated_depth import (
     SparseInverseDepth,
-    evaluate,
+    enlarged,
     ground_contact,
     interpolate,
     smooth_over_time,
     supported,
 )
+from uni4d_fg.cues.triangle_grid import linear_on_grid
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import Video
 from uni4d_fg.frontend.synthetic.simulate import Simulation, simulate
@@ -196,7 +198,7 @@ def plane(uv: np.ndarray) -> np.ndarray:
 
 def test_a_plane_is_interpolated_exactly_within_the_hull(rng: np.random.Generator) -> None:
     uv = np.concatenate([rng.uniform(0, 100, (200, 2)), [[-1, -1], [101, -1], [-1, 101], [101, 101]]])
-    dense = interpolate(SparseInverseDepth(uv, plane(uv)), (100, 100), 4)
+    dense = enlarged(interpolate(SparseInverseDepth(uv, plane(uv)), (100, 100), 4), (100, 100))
     rows, columns = np.indices((100, 100))
     exact = plane(np.stack([columns.ravel(), rows.ravel()], axis=1)).reshape(100, 100)
     # Beyond the outermost grid centers cv2.resize repeats the border.
@@ -206,7 +208,28 @@ def test_a_plane_is_interpolated_exactly_within_the_hull(rng: np.random.Generato
 @pytest.mark.parametrize("uv", [[[10.0, 10.0]], [[0.0, 0.0], [5.0, 5.0]], [[0.0, 0.0], [5.0, 5.0], [9.0, 9.0]]])
 def test_too_few_points_for_triangles_give_the_nearest(uv: list[list[float]]) -> None:
     points = SparseInverseDepth(np.array(uv), np.linspace(0.5, 0.7, len(uv)))
-    np.testing.assert_allclose(evaluate(points, np.array([[0.0, 1.0]])), 0.5)
+    grid = interpolate(points, (12, 12), 2)
+    assert grid[0, 0] == np.float32(points.inverse_depth[0])
+    assert grid[5, 5] == np.float32(points.inverse_depth[-1])
+    assert set(np.unique(grid)) <= set(points.inverse_depth.astype(np.float32))
+
+
+@pytest.mark.parametrize("kind", ["scattered", "on a lattice", "thin"])
+def test_values_on_a_grid_are_those_of_scipys_interpolator(kind: str, rng: np.random.Generator) -> None:
+    places = {
+        "scattered": rng.uniform(-3.0, 43.0, (300, 2)),
+        # Points on nodes, four on every circle; and triangles with a side along a row.
+        "on a lattice": np.stack(np.meshgrid(np.arange(0.0, 41.0, 4.0), np.arange(0.0, 31.0, 3.0)), -1).reshape(-1, 2),
+        "thin": rng.uniform(0.0, 1.0, (200, 2)) * [40.0, 1e-3] + [0.0, 15.0],
+    }[kind]
+    values = rng.uniform(0.1, 2.0, len(places))
+    found = linear_on_grid(places, values, (30, 40))
+    rows, columns = np.indices((30, 40))
+    expected = LinearNDInterpolator(places, values)(columns, rows)
+    both = np.isfinite(found) & np.isfinite(expected)
+    assert np.count_nonzero(np.isfinite(found) != np.isfinite(expected)) <= 1
+    np.testing.assert_allclose(found[both], expected[both], rtol=1e-6)
+    assert kind == "thin" or both.sum() > 1000
 
 
 def test_a_lone_wrong_point_has_no_support(rng: np.random.Generator) -> None:
@@ -223,7 +246,8 @@ def test_moving_things_stand_at_the_depth_of_the_ground_below_them(rng: np.rando
     mask = np.zeros((100, 100), dtype=np.int32)
     mask[20:71, 40:50] = 3  # stands at row 70
     mask[10:31, 70:90] = 5
-    contact = ground_contact(mask, SparseInverseDepth(uv, plane(uv)), GeometricDepthConfig())
+    inverse = enlarged(interpolate(SparseInverseDepth(uv, plane(uv)), (100, 100), 4), (100, 100))
+    contact = ground_contact(mask, inverse, GeometricDepthConfig())
     assert contact[3] == pytest.approx(0.2 + 0.002 * 44.5 + 0.004 * 70, rel=0.01)
     assert contact[5] == pytest.approx(0.2 + 0.002 * 79.5 + 0.004 * 30, rel=0.01)
 

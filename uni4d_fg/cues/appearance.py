@@ -21,6 +21,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.depth_range import DepthRange, depth_range
+from uni4d_fg.cues.guided_filter import sum_colors
 from uni4d_fg.cues.static_scene import predict_static
 
 _MEDIAN_OF_SQUARE = 0.455
@@ -62,8 +63,8 @@ def frame_appearance(
     scaled = depth * np.float32(np.exp(log_scale))
     return FrameAppearance(
         color,
-        ((gx * gx).sum(axis=2), (gx * gy).sum(axis=2), (gy * gy).sum(axis=2)),
-        np.maximum(variance, 0).sum(axis=2),
+        (sum_colors(gx * gx), sum_colors(gx * gy), sum_colors(gy * gy)),
+        sum_colors(np.maximum(variance, 0)),
         depth_range(scaled, edge_window_px),
     )
 
@@ -73,7 +74,7 @@ def moved_evidence(
     target: FrameAppearance,
     target_T_source: FloatArray,
     intrinsics: FloatArray,
-    shared: tuple[Float32Array, Float32Array],
+    shared: tuple[Float32Array, Float32Array] | None,
     config: MotionMaskConfig,
 ) -> Float32Array:
     """Return the log odds (h, w) that a pixel of ``source`` is not where a static scene has it in ``target``.
@@ -83,13 +84,15 @@ def moved_evidence(
         target: Frame it is compared with.
         target_T_source: (4, 4) pose of the source camera in the target camera.
         intrinsics: (4,) px at working size.
-        shared: Displacements (h, w) in x and y that errors of the cameras cause, px at working size.
+        shared: Displacements (h, w) in x and y that errors of the cameras cause, px at working size; None for none.
         config: Sigmas.
     """
     height, width = source.contrast.shape
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     static = predict_static(columns, rows, source.depth.log_depth, target_T_source, intrinsics)
-    u, v = (static.u + shared[0]).astype(np.float32), (static.v + shared[1]).astype(np.float32)
+    u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
+    if shared is not None:
+        u, v = u + shared[0], v + shared[1]
     inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
     seen = cv2.remap(target.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = source.color - seen
@@ -97,7 +100,7 @@ def moved_evidence(
     if not some.any():
         return np.zeros((height, width), np.float32)
     difference -= np.median(difference[::_SAMPLE, ::_SAMPLE][some], axis=0)  # exposure
-    squared = cv2.boxFilter((difference * difference).sum(axis=2), -1, (config.patch_px, config.patch_px))
+    squared = cv2.boxFilter(sum_colors(difference * difference), -1, (config.patch_px, config.patch_px))
 
     sigma_depth = config.depth_sigma + 0.5 * source.depth.spread
     du, dv = sigma_depth * static.du, sigma_depth * static.dv

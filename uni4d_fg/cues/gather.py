@@ -14,6 +14,7 @@ from uni4d_fg.counted import counted
 from uni4d_fg.cues.cache import FloatMaps
 from uni4d_fg.cues.geometric_depth import settings_for_geometry
 from uni4d_fg.cues.geometry_makers import aligned_depth, geometric_depth, moving_masks, video_key
+from uni4d_fg.cues.interpolated_depth import GridDepths
 from uni4d_fg.cues.intrinsics import shared_intrinsics
 from uni4d_fg.cues.manifest import save_manifest
 from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_masks, network_tracks
@@ -281,4 +282,6 @@ def static_tracks(tracks: Tracks, masks: FrameSource[Int32Array]) -> BoolArray:
 
 def _name_of(depths: FrameSource[Float32Array]) -> str:
     """Return what tells depth that was made from other depth of the same images; given depth is in the video's key."""
+    if isinstance(depths, GridDepths):
+        return depths.name
     return depths.paths[0].parent.name if isinstance(depths, FloatMaps) else "given"

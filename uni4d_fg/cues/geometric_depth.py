@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.interpolated_depth import (
     InterpolatedDepths,
     SparseInverseDepth,
+    enlarged,
     ground_contact,
     smooth_over_time,
     supported,
@@ -31,6 +32,7 @@ from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
+from uni4d_fg.optim.threads import map_in_order, thread_count, workers_in_order
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -70,6 +72,7 @@ def depth_from_motion(
     config: Config,
     reporter: Reporter | None = None,
     should_stop: Callable[[], bool] | None = None,
+    with_doubts: bool = True,
 ) -> GeometricDepth:
     """Find cameras and up-to-scale depth from tracks of the static scene.
 
@@ -82,6 +85,7 @@ def depth_from_motion(
         config: Sections ``geometric_depth``, ``bundle_adjustment`` and ``input``.
         reporter: Progress.
         should_stop: Polled often.
+        with_doubts: Also look for what the motion leaves open; not needed of what only leads to masks.
 
     Raises:
         InputError: If tracks, video and ``is_static`` do not fit each other.
@@ -102,7 +106,7 @@ def depth_from_motion(
             "everything marked as moving?) and the tracks, or give depth maps"
         )
     structure = structure_from_motion(
-        observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop
+        observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop, with_doubts
     )
     if structure is None:
         return _without_parallax(video, tracks, is_static, observations, intrinsics, config.geometric_depth)
@@ -197,10 +201,10 @@ def _normalize(structure: Structure, observations: Observations, median_depth: f
 
 def _inverse_depths(structure: Structure, observations: Observations, config: GeometricDepthConfig) -> FloatArray:
     """Return the inverse depth of every observation's point in its frame, (N,); NaN where poorly known."""
-    out = np.full(len(observations), np.nan)
     row = np.searchsorted(structure.track, observations.track)
     has_row = np.isin(observations.track, structure.track)
-    for frame in range(len(structure.world_T_cam)):
+
+    def of_frame(frame: int) -> tuple[IntArray, FloatArray]:
         mine = np.flatnonzero((observations.frame == frame) & has_row)
         pose, rows = structure.world_T_cam[frame], row[mine]
         position = structure.points.position[rows]
@@ -211,13 +215,17 @@ def _inverse_depths(structure: Structure, observations: Observations, config: Ge
             good &= error <= config.max_reprojection_px
         mine, rows, z = mine[good], rows[good], x[good, 2]
         if len(mine) == 0:
-            continue
+            return mine, z
         information = structure.points.information[rows]
         sigma = inverse_depth_sigma(pose, position[good], information, max(structure.sigma_px, 0.1))
         inverse = 1.0 / z
         typical = float(np.median(inverse))
         fine = (sigma <= config.max_relative_sigma * typical) & supported(observations.uv[mine], inverse, config)
-        out[mine[fine]] = np.maximum(inverse[fine], typical / config.max_depth_ratio)
+        return mine[fine], np.maximum(inverse[fine], typical / config.max_depth_ratio)
+
+    out = np.full(len(observations), np.nan)
+    for mine, inverse in map_in_order(of_frame, list(range(len(structure.world_T_cam))), thread_count()):
+        out[mine] = inverse
     return out
 
 
@@ -245,17 +253,20 @@ def _place(
     """Put what the masks mark where it stands, or where its motion shows it to be nearer; return facts and warnings."""
     if video.masks is None:
         return depths, [], []
-    standing = []
+    standing, grids = [], []
     sightings = Sightings(tracks)
     reporter.begin("depth of moving things", video.num_frames)
-    for frame in range(video.num_frames):
-        if should_stop():
-            raise Cancelled("depth from motion stopped")
-        mask = video.masks[frame]
-        standing.append(ground_contact(mask, depths.points[frame], depths.config))
-        sightings.add(frame, mask)
-        reporter.advance(frame + 1)
+    with workers_in_order(thread_count()) as mapped:
+        for frame, grid in enumerate(mapped(depths.grid, list(range(video.num_frames)))):
+            if should_stop():
+                raise Cancelled("depth from motion stopped")
+            mask = video.masks[frame]
+            standing.append(ground_contact(mask, enlarged(grid, video.image_size), depths.config))
+            sightings.add(frame, mask)
+            grids.append(grid)
+            reporter.advance(frame + 1)
     reporter.end()
+    depths = replace(depths, grids=tuple(grids))
     contacts = smooth_over_time(standing, depths.config.contact_smoothing)
     placed = place_moving(contacts, sightings, structure.world_T_cam, structure.intrinsics)
     facts = [

@@ -16,12 +16,14 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.affine_depth import align_affine
 from uni4d_fg.cues.cache import FloatMaps, FrameCache, image_key, maker_key
 from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
+from uni4d_fg.cues.interpolated_depth import GridDepths, InterpolatedDepths
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.frames import MaskFolder
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.optim.threads import thread_count, workers_in_order
 from uni4d_fg.progress import Reporter
 
 ShouldStop = Callable[[], bool]
@@ -57,30 +59,58 @@ def geometric_depth(
     )  # fmt: skip
     target = folder / "depth" / f"motion-{key}"
     cache = FrameCache(target)
-    stored = _stored_structure(cache, tracks)
+    # Without masks it only leads to them: what it is interpolated from takes less time and room than whole maps.
+    leads_to_masks = video.masks is None
+    stored = _stored_structure(cache, tracks, leads_to_masks)
     names = [f"{frame:06d}" for frame in range(video.num_frames)]
-    if stored is None or not all(cache.has_map(name, video.image_size) for name in names):
-        result = depth_from_motion(video, tracks, is_static, intrinsics, config, reporter, should_stop)
-        store_maps(result.depths, video.image_size, target, "depth maps", reporter, should_stop)
+    if stored is None or not (leads_to_masks or all(cache.has_map(name, video.image_size) for name in names)):
+        result = depth_from_motion(
+            video, tracks, is_static, intrinsics, config, reporter, should_stop, with_doubts=not leads_to_masks
+        )
+        arrays: dict[str, npt.NDArray[Any]] = {}
+        if leads_to_masks:
+            arrays["grids"] = np.stack(_grids(result.depths, reporter, should_stop))
+        else:
+            store_maps(result.depths, video.image_size, target, "depth maps", reporter, should_stop)
         said = json.dumps([list(result.facts), list(result.warnings), result.start])
         # Written last: with it, the maps are complete.
         cache.put_arrays(
             _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
-            has_parallax=np.array([result.has_parallax]), said=np.array(said),
+            has_parallax=np.array([result.has_parallax]), said=np.array(said), **arrays,
         )  # fmt: skip
-        stored = _stored_structure(cache, tracks)
+        stored = _stored_structure(cache, tracks, leads_to_masks)
         assert stored is not None
-    paths = tuple(cache.map_path(f"{frame:06d}") for frame in range(video.num_frames))
     facts, warnings, start = json.loads(str(stored["said"]))
+    depths: FrameSource[Float32Array]
+    if leads_to_masks:
+        depths = GridDepths(tuple(stored["grids"].astype(np.float32)), video.image_size, target.name)
+    else:
+        depths = FloatMaps(tuple(cache.map_path(name) for name in names), video.image_size)
     return GeometricDepth(
-        FloatMaps(paths, video.image_size), stored["world_T_cam"], stored["intrinsics"],
+        depths, stored["world_T_cam"], stored["intrinsics"],
         stored["sparse"].astype(np.float32), bool(stored["has_parallax"][0]), tuple(facts), tuple(warnings),
         start,
     )  # fmt: skip
 
 
-def _stored_structure(cache: FrameCache, tracks: Tracks) -> dict[str, npt.NDArray[Any]] | None:
+def _grids(depths: FrameSource[Float32Array], reporter: Reporter, should_stop: ShouldStop) -> list[Float32Array]:
+    """Return the grids from which depth of camera motion is interpolated, made on all threads."""
+    assert isinstance(depths, InterpolatedDepths)
+    grids = []
+    reporter.begin("depth maps", len(depths))
+    with workers_in_order(thread_count()) as mapped:
+        for grid in mapped(depths.grid, list(range(len(depths)))):
+            if should_stop():
+                raise Cancelled("depth from motion stopped")
+            grids.append(grid)
+            reporter.advance(len(grids))
+    reporter.end()
+    return grids
+
+
+def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> dict[str, npt.NDArray[Any]] | None:
     ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "has_parallax": 1, "said": None}
+    ranks |= {"grids": 3} if with_grids else {}
     stored = cache.arrays(_RECORD, ranks)
     return stored if stored is not None and stored["sparse"].shape == tracks.visible.shape else None
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +49,11 @@ def guided_filter(guide: Float32Array, values: Float32Array, radius_px: int, con
         )
         / np.maximum(determinant, 1e-12)[..., None]
     )
-    offset = mean_values - (slope * mean_guide).sum(axis=2)
-    result: Float32Array = (mean(slope) * guide).sum(axis=2) + mean(offset)
+    offset = mean_values - sum_colors(slope * mean_guide)
+    result: Float32Array = sum_colors(mean(slope) * guide) + mean(offset)
     return result
+
+
+def sum_colors(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the sum (h, w) over the colors of (h, w, 3): NumPy takes ten times as long to add up three numbers."""
+    return np.asarray(cv2.transform(image, np.ones((1, 3))))

@@ -13,16 +13,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array, evenly_spread
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.triangle_grid import linear_on_grid
 from uni4d_fg.frontend.sequence.frames import LazyFrames
 from uni4d_fg.frontend.sequence.model import FrameSource
-
-_MAX_CONTACT_COLUMNS = 200
-"""Columns whose median says where a thing stands: more only take longer."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +44,8 @@ class InterpolatedDepths(LazyFrames[Float32Array]):
     masks: FrameSource[Int32Array] | None = None
     standing: tuple[Mapping[int, float], ...] = field(default=())
     """T: inverse depth of every moving thing in a frame, by mask id."""
+    grids: tuple[Float32Array, ...] = field(default=())
+    """T: what :func:`interpolate` gives, where that was asked for before; else it is computed with each map."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -55,8 +54,16 @@ class InterpolatedDepths(LazyFrames[Float32Array]):
         """Return the frame number; there is no file."""
         return f"interpolated depth [frame {frame}]"
 
+    def static(self, frame: int) -> Float32Array:
+        """Return the inverse depth (H, W) of the static scene, also behind what moves."""
+        return enlarged(self.grids[frame] if self.grids else self.grid(frame), self.image_size)
+
+    def grid(self, frame: int) -> Float32Array:
+        """Return the static inverse depth of a frame on the grid of ``config.stride``."""
+        return interpolate(self.points[frame], self.image_size, self.config.stride)
+
     def _read(self, frame: int) -> Float32Array:
-        inverse = interpolate(self.points[frame], self.image_size, self.config.stride)
+        inverse = self.static(frame)
         if self.masks is not None:
             mask = self.masks[frame]
             for label, value in self.standing[frame].items():
@@ -64,40 +71,56 @@ class InterpolatedDepths(LazyFrames[Float32Array]):
         return (1.0 / inverse).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class GridDepths(LazyFrames[Float32Array]):
+    """T depth maps of a static scene, each enlarged when it is asked for."""
+
+    grids: tuple[Float32Array, ...]
+    """T: inverse depth as :func:`interpolate` gives it."""
+    image_size: tuple[int, int]
+    """(height, width), px."""
+    name: str
+    """What tells it from other depth of the same images."""
+
+    def __len__(self) -> int:
+        return len(self.grids)
+
+    def where(self, frame: int) -> str:
+        """Return the frame number; there is no file of its own."""
+        return f"interpolated depth [frame {frame}]"
+
+    def _read(self, frame: int) -> Float32Array:
+        return (1.0 / enlarged(self.grids[frame], self.image_size)).astype(np.float32)
+
+
 def interpolate(points: SparseInverseDepth, image_size: tuple[int, int], stride: int) -> Float32Array:
-    """Interpolate inverse depth over an image.
+    """Interpolate inverse depth over an image: linearly over triangles, and from the nearest point outside of them.
 
     Args:
         points: At least one point.
         image_size: (height, width), px.
-        stride: Spacing of the grid on which it is computed; bilinear in between.
+        stride: Spacing of the grid on which it is computed; :func:`enlarged` fills what is between.
 
     Returns:
-        (H, W), positive.
+        (rows, columns) of the grid, positive.
     """
     height, width = image_size
     rows, columns = -(-height // stride), -(-width // stride)
     # Centers as cv2.resize places them, so that its bilinear interpolation has no shift.
-    v = (np.arange(rows) + 0.5) * height / rows - 0.5
-    u = (np.arange(columns) + 0.5) * width / columns - 0.5
-    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    coarse = evaluate(points, grid).reshape(rows, columns).astype(np.float32)
-    return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+    scale = np.array([columns / width, rows / height])
+    places = (points.uv + 0.5) * scale - 0.5
+    grid = linear_on_grid(places, points.inverse_depth, (rows, columns))
+    row, column = np.nonzero(~np.isfinite(grid))
+    if len(row):
+        uv = (np.stack((column, row), axis=1) + 0.5) / scale - 0.5
+        grid[row, column] = points.inverse_depth[cKDTree(points.uv).query(uv)[1]]
+    return grid.astype(np.float32)
 
 
-def evaluate(points: SparseInverseDepth, uv: FloatArray) -> FloatArray:
-    """Return the interpolated inverse depth at pixels (M, 2), (M,)."""
-    result: FloatArray = np.full(len(uv), np.nan)
-    try:
-        triangles = Delaunay(points.uv)
-    except (QhullError, ValueError):  # fewer than three points, or all on one line
-        pass
-    else:
-        result = np.asarray(LinearNDInterpolator(triangles, points.inverse_depth)(uv), dtype=np.float64)
-    outside = ~np.isfinite(result)
-    if outside.any():
-        result[outside] = NearestNDInterpolator(points.uv, points.inverse_depth)(uv[outside])
-    return result
+def enlarged(grid: Float32Array, image_size: tuple[int, int]) -> Float32Array:
+    """Return what :func:`interpolate` gives as (H, W), bilinearly; ``image_size`` is (height, width)."""
+    height, width = image_size
+    return np.asarray(cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
 
 def supported(uv: FloatArray, inverse_depth: FloatArray, config: GeometricDepthConfig) -> BoolArray:
@@ -114,12 +137,12 @@ def supported(uv: FloatArray, inverse_depth: FloatArray, config: GeometricDepthC
     return result
 
 
-def ground_contact(mask: Int32Array, points: SparseInverseDepth, config: GeometricDepthConfig) -> dict[int, float]:
+def ground_contact(mask: Int32Array, inverse: Float32Array, config: GeometricDepthConfig) -> dict[int, float]:
     """Return the inverse depth of the static surface just below every thing of a mask, by id.
 
     Args:
         mask: (H, W) 0 static, > 0 ids.
-        points: Static points of the frame.
+        inverse: (H, W) inverse depth of the static surface of the frame.
         config: ``contact_fraction``.
     """
     out: dict[int, float] = {}
@@ -131,9 +154,7 @@ def ground_contact(mask: Int32Array, points: SparseInverseDepth, config: Geometr
         columns = np.flatnonzero(lowest.any(axis=0))
         # The lowest pixel of each column in that part.
         line = lines[-1] - np.argmax(lowest[::-1, columns], axis=0)
-        some = evenly_spread(len(columns), _MAX_CONTACT_COLUMNS)
-        uv = np.stack([columns[some], line[some]], axis=1).astype(np.float64)
-        out[int(label)] = float(np.median(evaluate(points, uv)))
+        out[int(label)] = float(np.median(inverse[line, columns]))
     return out
 
 

@@ -35,10 +35,11 @@ from uni4d_fg.cues.moving_regions import moving_region, track_evidence, trusted_
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.static_scene import relative_pose
-from uni4d_fg.cues.track_motion import SharedError, TrackMotion, find_moving_tracks
+from uni4d_fg.cues.track_motion import QuadraticGrid, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.optim.threads import OrderedMap, thread_count, workers_in_order
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.stages.scene import Cameras
 
@@ -160,7 +161,8 @@ def _tracks_and_cameras(
             observations_per_frame=config.max_bundle_observations,
             should_stop=stop,
         )
-        motion = find_moving_tracks(known.labelled, spread, cameras, video.image_size, config)
+        is_last = turn == config.camera_rounds - 1
+        motion = find_moving_tracks(known.labelled, spread, cameras, video.image_size, config, with_shared=is_last)
         motion = replace(motion, moving=motion.moving | outlier, static=motion.static & ~outlier)
         moving = motion.moving
         report.advance(turn + 1)
@@ -189,6 +191,7 @@ class _Comparison:
         fx, fy, cx, cy = cameras.intrinsics
         sx, sy = self.scale
         self.intrinsics = np.array([fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5])
+        self.grid = QuadraticGrid.of(self.size, self.scale, video.image_size)
         self.images: dict[int, ImageArray] = {}
         self.frames: dict[int, FrameAppearance] = {}
         self.flow = DenseFlow(fine=False)
@@ -197,19 +200,23 @@ class _Comparison:
         """Yield the regions that move, frame by frame."""
         count = self.video.num_frames
         window: deque[Float32Array] = deque()  # evidence of the frame before, of this one, and of the next
-        for frame in range(count + 1):
-            if stop():
-                raise Cancelled("stopped while comparing frames for the motion masks")
-            if frame < count:
-                window.append(self._evidence(frame))
-            if frame == 0:
-                continue
-            this = frame - 1
-            near = {this - 1 + n + (0 if this else 1): evidence for n, evidence in enumerate(window)}
-            yield self._regions(this, near)
-            if this > 0:
-                window.popleft()
-            self._forget_before(this - max(self.config.baselines))
+        with workers_in_order(thread_count()) as mapped:
+            compared = self._compared(0, mapped)
+            for frame in range(count + 1):
+                if stop():
+                    raise Cancelled("stopped while comparing frames for the motion masks")
+                if frame < count:
+                    window.append(self._evidence(frame, compared))
+                if frame + 1 < count:  # on the threads, while this one finds regions
+                    compared = self._compared(frame + 1, mapped)
+                if frame == 0:
+                    continue
+                this = frame - 1
+                near = {this - 1 + n + (0 if this else 1): evidence for n, evidence in enumerate(window)}
+                yield self._regions(this, near)
+                if this > 0:
+                    window.popleft()
+                self._forget_before(this - max(self.config.baselines))
 
     def _frame(self, frame: int) -> FrameAppearance:
         if frame not in self.frames:
@@ -226,34 +233,39 @@ class _Comparison:
             for old in [f for f in kept if f < frame]:
                 del kept[old]
 
-    def _evidence(self, frame: int) -> Float32Array:
+    def _pairs(self, frame: int) -> list[list[tuple[int, int]]]:
+        """Return the pairs of frames that tell what moves in a frame, by baseline."""
+        return [
+            [(frame, f) for f in (frame - step, frame + step) if 0 <= f < self.video.num_frames]
+            for step in self.config.baselines
+        ]
+
+    def _compared(self, frame: int, mapped: OrderedMap) -> Iterator[Float32Array]:
+        """Begin to compare a frame with others; return what :meth:`_pair` says of each pair."""
+        pairs = [pair for sides in self._pairs(frame) for pair in sides]
+        for needed in sorted({f for pair in pairs for f in pair}):
+            self._frame(needed)
+        return mapped(self._pair, pairs)
+
+    def _evidence(self, frame: int, compared: Iterator[Float32Array]) -> Float32Array:
         total, count = np.zeros(self.size, np.float32), 0
-        for step in self.config.baselines:
-            sides = [self._pair(frame, f) for f in (frame - step, frame + step) if 0 <= f < self.video.num_frames]
+        for sides in self._pairs(frame):
             if sides:
-                total += np.minimum.reduce(sides)
+                total += np.minimum.reduce([next(compared) for _ in sides])
                 count += 1
         if count:
             total *= len(self.config.baselines) / count
         tracks = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
         return total + np.float32(self.config.track_weight) * tracks
 
-    def _pair(self, source: int, target: int) -> Float32Array:
-        shared = self._shared(self.motion.shared.get((source, target)))
+    def _pair(self, pair: tuple[int, int]) -> Float32Array:
+        source, target = pair
+        error = self.motion.shared.get(pair)
+        shared = None if error is None else self.grid.displacement(error)
         pose = relative_pose(self.cameras.world_T_cam, source, target)
         return moved_evidence(
             self._frame(source), self._frame(target), pose, self.intrinsics, shared, self.config
         )  # fmt: skip
-
-    def _shared(self, error: SharedError | None) -> tuple[Float32Array, Float32Array]:
-        if error is None:
-            return np.zeros(self.size, np.float32), np.zeros(self.size, np.float32)
-        sx, sy = self.scale
-        columns = (np.arange(self.size[1]) + 0.5) / sx - 0.5
-        rows = (np.arange(self.size[0]) + 0.5) / sy - 0.5
-        u, v = np.meshgrid(columns, rows)
-        x, y = error.at(u, v)
-        return (x * sx).astype(np.float32), (y * sy).astype(np.float32)
 
     def _regions(self, frame: int, near: dict[int, Float32Array]) -> FrameDetections:
         evidence, weight = near[frame].copy(), self.config.neighbor_frames_weight
