@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +61,7 @@ _ADDS_NOTHING = "adds nothing to this cue, as landmarks say"
 
 
 class FinalStatic(NamedTuple):
-    """Static depth of one frame after averaging, at working size."""
+    """Static depth of one frame after averaging, as the image shows it, shrunk to the working size."""
 
     log_depth: Float32Array
     """(h, w), NaN where missing."""
@@ -115,7 +115,8 @@ class DenseMaps:
     unmatched: str
     """Why there is no depth from several views."""
     threads: int
-    size: WorkingSize = field(init=False)
+    size: WorkingSize
+    """Of what is done before depth is brought to the size of the images."""
     multiview: MultiviewDepth = field(init=False)
     bleeding_px: float = 0.0
     """How far the cue bleeds across edges, working px."""
@@ -129,7 +130,6 @@ class DenseMaps:
 
     def __post_init__(self) -> None:
         multiview = self.config.multiview
-        self.size = WorkingSize.of(self.sequence.image_size, multiview.longer_side_px)
         poses: FloatArray = self.scene["world_T_cam"]
         self.multiview = MultiviewDepth(
             self._working_frame, self.size, self.intrinsics[0], poses, self._landmarks, multiview, self.threads
@@ -209,27 +209,31 @@ class DenseMaps:
             self._camera(frame),
             self.config.averaged_sigmas * float(np.clip(mine.depth.sigma, *_AVERAGED_SIGMA)),
         )
+        averaged = averaged._replace(log_depth=self.size.continued(averaged.log_depth))
         sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
         sure[~mine.unmasked & (mine.depth.matched <= STILL)] = 0
+        log_depth = self.size.shown(averaged.log_depth)
         if frame in self.broken or self.bleeding_px:
-            full = np.exp(upsample_guided(averaged.log_depth, self.sequence.images[frame]))
+            full = np.exp(upsample_guided(log_depth, self.sequence.images[frame]))
             full[np.isnan(given)] = np.nan
         else:
-            full = lifted(averaged.log_depth, mine.log_cue, given, self.size)
+            full = lifted(averaged.log_depth, self.size.continued(mine.log_cue), given, self.size)
         moving = mask > 0
         if moving.any():
             # Masks reach beyond what moves: what other frames see there just the same stands still.
             if frame in self.matched:
                 static = without_band(mine.unmasked, self.config.multiview.mask_band_px)
-                still = stands_still(self.sequence.images[frame], mask, mine.depth.matched, static)
-                moving &= self.size.enlarge(still.astype(np.float32)) <= _HALF
+                matched, static = self.size.shown(mine.depth.matched), self.size.shown(static)
+                still = stands_still(self.sequence.images[frame], mask, matched, static)
+                moving &= self.size.plain.enlarge(still.astype(np.float32)) <= _HALF
             full[moving] = np.exp(self._moving(frame, given, mask)[moving])
-        return full, FinalStatic(averaged.log_depth, sure, mine.unmasked)
+        sure = self.size.shown(self.size.continued(sure))
+        return full, FinalStatic(log_depth, sure, self.size.shown(mine.unmasked))
 
     def landmarks_in(self, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Return where a frame sees landmarks, (N, 2) working px, and their log depth (N,)."""
-        uv, log_scale, log_cue = self._landmark_cues(frame)
-        return uv, log_scale + log_cue
+        """Return where a frame shows landmarks, (N, 2) px of the shrunk image, and their log depth (N,)."""
+        _, log_scale, log_cue = self._landmark_cues(frame)
+        return self.size.plain.pixels(self.control[frame].uv[self._usable(frame)]), log_scale + log_cue
 
     def _given(self, frame: int) -> Float32Array:
         """Return the cue (H, W), m, NaN where it is not a depth."""
@@ -242,7 +246,7 @@ class DenseMaps:
         mine = self.control[frame]
         corrected = self._static(frame).depth.corrected
         log_depth = corrected.affine(given) + self.size.enlarge(corrected.field)
-        radius = self.bleeding_px / self.size.scale[0]
+        radius = self.bleeding_px / (self.size.scale[0] * self.size.factor)
         for label in np.unique(mask[mask > 0]).tolist():
             pixels = mask == label
             if frame in self.broken:
@@ -295,14 +299,17 @@ class DenseMaps:
         if measured is not None and self.bleeding_px == 0:
             measured = without_edges(measured, judged.cue)
         fused = self._fused(frame, judged, measured)
+        fused = replace(fused, log_depth=self.size.within(fused.log_depth, np.nan))
         with np.errstate(invalid="ignore"):
             return _Made(fused, np.exp(-fused.log_depth), np.log(judged.cue), judged.unmasked)
 
     def _judged(self, frame: int, measured: Measured | None) -> _Judged:
         broken = frame in self.broken
         cue = self._carried(frame) if broken else self.size.depth(self._given(frame))
+        cue = self.size.within(cue, np.nan)
         unmasked = ~self.size.marked(self.sequence.masks[frame])
         static = without_band(unmasked, self.config.multiview.mask_band_px)
+        unmasked, static = self.size.within(unmasked, False), self.size.within(static, False)
         uv, log_scale_at, log_cue = self._landmark_cues(frame)
         share = self._shares(frame)
         if not broken:
@@ -319,7 +326,9 @@ class DenseMaps:
         known = known_depth(measured, judged.uv, judged.log_z, judged.static, judged.cue.shape, judged.share)
         like_moving = np.zeros_like(judged.static)
         if self.bleeding_px > 0 and not judged.static.all():
-            like_moving = looks_moving(self.sequence.images[frame], self.sequence.masks[frame], judged.static)
+            static = self.size.shown(judged.static)
+            like_moving = looks_moving(self.sequence.images[frame], self.sequence.masks[frame], static)
+            like_moving = self.size.straight(like_moving)
         log_scale = float(self.scene["log_scale"][frame])
         return fuse_static(
             judged.cue, measured, known, judged.errors.cue, judged.static, like_moving, log_scale, self.bleeding_px,

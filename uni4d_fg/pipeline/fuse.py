@@ -29,6 +29,8 @@ from uni4d_fg.results.confidence_store import write_confidence
 from uni4d_fg.results.depth_store import write_depth
 from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.densify import ControlPoints
+from uni4d_fg.results.fusion.multiview.ideal_size import ideal_size
+from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 from uni4d_fg.results.fusion.told_error import ToldError
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import zoomed
@@ -61,7 +63,7 @@ def fuse_depth(
         reporter: Progress, in frames.
         should_stop: Polled before every frame.
         zoom: (T,) focal length of each frame over that of the record's intrinsics; None without a zoom.
-        lens: Distortion of the images; distorted ones are not matched.
+        lens: Distortion of the images.
 
     Returns:
         What the summary says of it: ``facts``, ``warnings`` and ``broken_frames``.
@@ -80,6 +82,8 @@ def fuse_depth(
     shares = landmark_shares(labelled, scene, intrinsics)
     control = [control_points(labelled, scene, motion, frame, shares) for frame in range(sequence.num_frames)]
     broken = contradicting_frames(control, config)
+    plain = WorkingSize.of(sequence.image_size, config.multiview.longer_side_px)
+    size = ideal_size(plain, lens, intrinsics[0]) if zoom is None else plain
     maps = DenseMaps(
         sequence,
         control,
@@ -87,8 +91,9 @@ def fuse_depth(
         config,
         intrinsics,
         frozenset(broken),
-        _unmatchable(config, zoom, lens),
+        _unmatchable(config, zoom, size),
         thread_count(),
+        size or plain,
     )
     maps.try_matching()
     told = ToldError()
@@ -115,15 +120,15 @@ def fuse_depth(
     return _summary(maps, told)
 
 
-def _unmatchable(config: FusionConfig, zoom: FloatArray | None, lens: Lens) -> str:
-    """Return why there can be no depth from several views; nothing if there can be."""
+def _unmatchable(config: FusionConfig, zoom: FloatArray | None, size: WorkingSize | None) -> str:
+    """Return why there can be no depth from several views, which no size is for; nothing if there can be."""
     core, reason = find_extension()
     if not config.multiview.enabled:
         return "is switched off"
-    if not lens.is_pinhole:
-        return "is not made of distorted images"
     if zoom is not None:
         return "is not made of frames that zoom"
+    if size is None:
+        return "is not made of images of so wide a lens"
     return "" if core is not None else f"is left out, as {reason}: run `{INSTALL_COMMAND}`"
 
 

@@ -60,7 +60,11 @@ class MultiviewDepth:
             return None
         near = [frame + sign * offset for offset in self.config.compared_offsets for sign in (-1, 1)]
         others = [
-            (other.inverse_depth, self.world_T_cam[number], self.size.intrinsics(self.intrinsics))
+            (
+                self.size.within(other.inverse_depth, np.nan),
+                self.world_T_cam[number],
+                self.size.intrinsics(self.intrinsics),
+            )
             for number in near
             if 0 <= number < len(self.world_T_cam) and (other := self._raw(number)) is not None
         ]
@@ -69,14 +73,15 @@ class MultiviewDepth:
             self.config.max_disagreement, self.threads,
         )  # fmt: skip
         evidence = own.evidence.with_neighbors(averaged.agreeing, averaged.seeing)
-        return Measured(averaged.log_depth, confidence(evidence), relative_sigma(evidence))
+        sure = self.size.within(confidence(evidence), 0)
+        return Measured(averaged.log_depth, sure, relative_sigma(evidence))
 
     def alone(self, frame: int) -> Measured | None:
         """Return the depth of a frame without comparing it with that of others, taken to be sure everywhere."""
         own = self._raw(frame)
         if own is None:
             return None
-        sure = np.ones_like(own.inverse_depth)
+        sure = self.size.within(np.ones_like(own.inverse_depth), 0)
         return Measured(-np.log(own.inverse_depth), sure, relative_sigma(own.evidence))
 
     def forget_before(self, frame: int) -> None:
@@ -99,7 +104,8 @@ class MultiviewDepth:
         points, pose = self.seen(frame), self.world_T_cam[frame]
         z = world_to_camera(np.broadcast_to(pose, (len(points), 4, 4)), points)[:, 2]
         points, z = points[z > 0], z[z > 0]
-        views = choose_views(frame, self.world_T_cam, points, self.intrinsics, self.size.image_size, self.config)
+        pinhole = self.intrinsics * np.array([self.size.factor, self.size.factor, 1.0, 1.0])
+        views = choose_views(frame, self.world_T_cam, points, pinhole, self.size.image_size, self.config)
         if not views:
             return None
         other_T_cam = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
@@ -111,4 +117,6 @@ class MultiviewDepth:
             self.threads,
         )  # fmt: skip
         step = np.float32(planes[1] - planes[0])
-        return _Raw(swept.inverse_depth, Evidence.of(swept, step / swept.inverse_depth, len(views)))
+        return _Raw(
+            self.size.continued(swept.inverse_depth), Evidence.of(swept, step / swept.inverse_depth, len(views))
+        )

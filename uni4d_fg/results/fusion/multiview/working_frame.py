@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
 
-_ONE_SURFACE = 0.04
+ONE_SURFACE = 0.04
 """Log depths that differ by less are averaged."""
+MapT = TypeVar("MapT", BoolArray, Float32Array, ImageArray)
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,13 @@ class WorkingSize:
     width: int
     image_size: tuple[int, int]
     """(H, W), px."""
+    factor: float = 1.0
+    """Focal length of maps of this size over that of the shrunk images."""
+
+    @property
+    def plain(self) -> WorkingSize:
+        """The same without a lens: that of the shrunk images, whatever bends them."""
+        return self
 
     @classmethod
     def of(cls, image_size: tuple[int, int], longer_side: int) -> WorkingSize:
@@ -38,7 +47,7 @@ class WorkingSize:
         """Return fx, fy, cx, cy (4,) at this size."""
         x, y = self.scale
         fx, fy, cx, cy = intrinsics
-        return np.array([fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5])
+        return np.array([fx * x * self.factor, fy * y * self.factor, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5])
 
     def pixels(self, uv: FloatArray) -> FloatArray:
         """Return image pixels (N, 2) in working pixels."""
@@ -56,10 +65,7 @@ class WorkingSize:
         known = np.isfinite(depth)
         share = cv2.resize(known.astype(np.float32), sides, interpolation=cv2.INTER_AREA)
         inverse = cv2.resize(np.where(known, 1.0 / depth, np.float32(0)), sides, interpolation=cv2.INTER_AREA)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            mean = share / inverse
-            alike = np.abs(np.log(mean / picked)) < _ONE_SURFACE
-        return np.asarray(np.where(alike, mean, picked), dtype=np.float32)
+        return on_one_surface(picked, share, inverse)
 
     def marked(self, mask: Int32Array) -> BoolArray:
         """Return where any pixel of a mask (H, W) is set, at this size."""
@@ -70,6 +76,36 @@ class WorkingSize:
         """Return a map of this size as (H, W), bilinear."""
         large = cv2.resize(values, (self.image_size[1], self.image_size[0]), interpolation=cv2.INTER_LINEAR)
         return np.asarray(large, dtype=np.float32)
+
+    def shown(self, values: MapT) -> MapT:
+        """Return a map of this size as the shrunk image shows it."""
+        return values
+
+    def straight(self, mask: BoolArray) -> BoolArray:
+        """Return a mask of the shrunk image as one of this size; what the image does not show is not in it."""
+        return mask
+
+    def within(self, values: MapT, otherwise: float) -> MapT:
+        """Return a map of this size with another value where the image shows nothing."""
+        return values
+
+    def continued(self, values: Float32Array) -> Float32Array:
+        """Return a map of this size with the value of the nearest pixel where the image shows nothing."""
+        return values
+
+
+def on_one_surface(picked: Float32Array, share: Float32Array, inverse: Float32Array) -> Float32Array:
+    """Return mean depth where one pixel's is like it, else that pixel's, (h, w).
+
+    Args:
+        picked: (h, w) depth of one pixel, m.
+        share: (h, w) part of the pixels whose depth is known.
+        inverse: (h, w) mean inverse depth, 0 counted where it is not known.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = share / inverse
+        alike = np.abs(np.log(mean / picked)) < ONE_SURFACE
+    return np.asarray(np.where(alike, mean, picked), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -92,7 +128,7 @@ def working_frame(image: ImageArray, mask: Int32Array, size: WorkingSize, band_p
         band_px: Width of the band, working px.
     """
     gray = size.shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float32)) / np.float32(255.0)
-    static = without_band(~size.marked(mask), band_px)
+    static = size.within(without_band(~size.marked(mask), band_px), False)
     return WorkingFrame(gray, np.where(static, gray, np.float32(np.nan)))
 
 
