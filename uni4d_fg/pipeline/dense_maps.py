@@ -246,7 +246,7 @@ class DenseMaps:
         mine = self.control[frame]
         corrected = self._static(frame).depth.corrected
         log_depth = corrected.affine(given) + self.size.enlarge(corrected.field)
-        radius = self.bleeding_px / (self.size.scale[0] * self.size.factor)
+        radius = self.bleeding_px / self.size.scale[0]
         for label in np.unique(mask[mask > 0]).tolist():
             pixels = mask == label
             if frame in self.broken:

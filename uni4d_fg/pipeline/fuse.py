@@ -100,7 +100,7 @@ def fuse_depth(
     remove_file(folder.confidence)
     with ExitStack() as files:
         writer = files.enter_context(write_depth(folder.depth, sequence.num_frames, sequence.image_size))
-        working = maps.size.height, maps.size.width
+        working = plain.height, plain.width
         sure = None
         if config.static == "field":
             sure = files.enter_context(write_confidence(folder.confidence, sequence.num_frames, working))

@@ -11,8 +11,8 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array, Int
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.results.fusion.multiview.working_frame import ONE_SURFACE, MapT, WorkingSize, on_one_surface
 
-_LEAST_FACTOR = 0.5
-"""A lens for which the focal length has to shrink by more leaves too few pixels in the middle."""
+_MOST_PIXELS = 3.0
+"""A lens for which a pinhole needs more than this many times the pixels is not undone."""
 _ANY = 1e-3
 _SAME_PX = 0.1
 """Ideal pixels that do not come back to themselves by as much lie past the lens's fold."""
@@ -26,8 +26,12 @@ class IdealSize(WorkingSize):
     """
 
     lens: Lens
+    shrunk: WorkingSize
+    """Of the images, without regard to the lens."""
     camera: FloatArray
-    """(4,) intrinsics of the images at working size, px."""
+    """(4,) intrinsics of the shrunk images, px."""
+    shift: FloatArray
+    """(2,) of the principal point from there to these maps, px."""
     to_real: Float32Array
     """(h, w, 2) where the shrunk image shows each pixel, working px; far outside of it where it does not."""
     to_ideal: Float32Array
@@ -42,21 +46,33 @@ class IdealSize(WorkingSize):
     @property
     def plain(self) -> WorkingSize:
         """That of the shrunk images."""
-        return WorkingSize(self.height, self.width, self.image_size)
+        return self.shrunk
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Working pixels per image pixel, along u and v, at the principal point."""
+        return self.shrunk.scale
+
+    def intrinsics(self, intrinsics: FloatArray) -> FloatArray:
+        """Return fx, fy, cx, cy (4,) of these maps."""
+        return self.shrunk.intrinsics(intrinsics) + np.array([0.0, 0.0, *self.shift])
+
+    def pinhole(self, intrinsics: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
+        """Return intrinsics (4,) and size (height, width), px, of a pinhole that sees what the images show."""
+        return self.intrinsics(intrinsics), (self.height, self.width)
 
     def pixels(self, uv: FloatArray) -> FloatArray:
         """Return image pixels (N, 2) in working pixels, ideal ones; far outside if no direction reaches them."""
-        center = self.camera[2:]
-        ideal = self.lens.ideal_pixels(self.camera, super().pixels(uv))
-        return np.nan_to_num(center + self.factor * (ideal - center), nan=-1e6)
+        ideal = self.lens.ideal_pixels(self.camera, self.shrunk.pixels(uv))
+        return np.nan_to_num(ideal + self.shift, nan=-1e6)
 
     def shrink(self, values: Float32Array) -> Float32Array:
         """Return a map (H, W) at this size; where the image does not reach, it goes on."""
-        return self.continued(_sampled(super().shrink(values), self.to_real))
+        return self.continued(_sampled(self.shrunk.shrink(values), self.to_real))
 
     def depth(self, depth: Float32Array) -> Float32Array:
         """Return a depth map (H, W) at this size, as the plain one does; NaN where the image does not reach."""
-        small = super().depth(depth)
+        small = self.shrunk.depth(depth)
         known = np.isfinite(small)
         picked = _picked(small, self.to_real, np.nan)
         share = _sampled(known.astype(np.float32), self.to_real)
@@ -65,7 +81,7 @@ class IdealSize(WorkingSize):
 
     def marked(self, mask: Int32Array) -> BoolArray:
         """Return where any pixel of a mask (H, W) is set, at this size."""
-        return np.asarray(_sampled(super().marked(mask).astype(np.float32), self.to_real) > _ANY) & self.inside
+        return np.asarray(_sampled(self.shrunk.marked(mask).astype(np.float32), self.to_real) > _ANY) & self.inside
 
     def enlarge(self, values: Float32Array) -> Float32Array:
         """Return a map of this size as (H, W), bilinear."""
@@ -96,7 +112,7 @@ class IdealSize(WorkingSize):
 def ideal_size(plain: WorkingSize, lens: Lens, intrinsics: FloatArray) -> WorkingSize | None:
     """Return the working size of images that a lens bends; None if it is too wide for a pinhole.
 
-    The focal length shrinks until all that the image shows fits in. It never grows, as no pixels would be gained.
+    The focal length is that of the shrunk images, so that the middle keeps its pixels, and all that they show fits in.
 
     Args:
         plain: That of a pinhole's images, which is returned for a pinhole.
@@ -106,40 +122,45 @@ def ideal_size(plain: WorkingSize, lens: Lens, intrinsics: FloatArray) -> Workin
     if lens.is_pinhole:
         return plain
     camera = plain.intrinsics(intrinsics)
-    center = camera[2:]
-    last = np.array([plain.width - 1, plain.height - 1], dtype=np.float64)
-    grid = np.stack(np.meshgrid(np.arange(plain.width), np.arange(plain.height)), axis=-1).astype(np.float64)
-    away = lens.ideal_pixels(camera, grid) - center
-    factor = _fitting(away, center, last) if np.isfinite(away).all() else 0.0
-    if factor < _LEAST_FACTOR:
+    ideal = lens.ideal_pixels(camera, _grid(plain.height, plain.width))
+    if not np.isfinite(ideal).all():
         return None
-    ideal = center + (grid - center) / factor
-    real = lens.real_pixels(camera, ideal)
-    # Beyond its fold a lens would show things twice.
-    with np.errstate(invalid="ignore"):
-        same = np.abs(lens.ideal_pixels(camera, real) - ideal).max(axis=-1) < _SAME_PX
-    inside: BoolArray = same & (real > -0.5).all(axis=-1) & (real < last + 0.5).all(axis=-1)
-    to_ideal = (center + factor * away).astype(np.float32)
-    height, width = plain.image_size
+    first = np.floor(ideal.min(axis=(0, 1)))
+    width, height = (float(side) for side in np.ceil(ideal.max(axis=(0, 1))) - first + 1)
+    if width * height > _MOST_PIXELS * plain.width * plain.height:
+        return None
+    to_real, inside = _real(lens, camera, _grid(int(height), int(width)) + first, (plain.width, plain.height))
+    to_ideal = (ideal - first).astype(np.float32)
+    full = plain.image_size[1], plain.image_size[0]
     return IdealSize(
-        plain.height,
-        plain.width,
+        int(height),
+        int(width),
         plain.image_size,
-        factor,
         lens=lens,
+        shrunk=plain,
         camera=camera,
-        to_real=np.where(inside[..., None], np.clip(real, 0, last), -1e4).astype(np.float32),
+        shift=-first,
+        to_real=to_real,
         to_ideal=to_ideal,
-        from_image=np.asarray(cv2.resize(to_ideal, (width, height), interpolation=cv2.INTER_LINEAR), np.float32),
+        from_image=np.asarray(cv2.resize(to_ideal, full, interpolation=cv2.INTER_LINEAR), np.float32),
         inside=inside,
         nearest=_nearest(inside),
     )
 
 
-def _fitting(away: FloatArray, center: FloatArray, last: FloatArray) -> float:
-    """Return the factor, 1 at most, that brings all pixels, given from the center, between the first and the last."""
-    room = np.where(away > 0, last - center, center)
-    return float(np.min(room / np.maximum(np.abs(away), 1e-9), initial=1.0))
+def _grid(height: int, width: int) -> FloatArray:
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+
+
+def _real(lens: Lens, camera: FloatArray, ideal: FloatArray, sides: tuple[int, int]) -> tuple[Float32Array, BoolArray]:
+    """Return where an image of a width and height shows ideal pixels (h, w, 2), and whether it does, (h, w)."""
+    last = np.array(sides) - 1.0
+    real = lens.real_pixels(camera, ideal)
+    # Beyond its fold a lens would show things twice.
+    with np.errstate(invalid="ignore"):
+        same = np.abs(lens.ideal_pixels(camera, real) - ideal).max(axis=-1) < _SAME_PX
+    inside: BoolArray = same & (real > -0.5).all(axis=-1) & (real < last + 0.5).all(axis=-1)
+    return np.where(inside[..., None], np.clip(real, 0, last), -1e4).astype(np.float32), inside
 
 
 def _nearest(inside: BoolArray) -> IntArray:

@@ -104,8 +104,7 @@ class MultiviewDepth:
         points, pose = self.seen(frame), self.world_T_cam[frame]
         z = world_to_camera(np.broadcast_to(pose, (len(points), 4, 4)), points)[:, 2]
         points, z = points[z > 0], z[z > 0]
-        pinhole = self.intrinsics * np.array([self.size.factor, self.size.factor, 1.0, 1.0])
-        views = choose_views(frame, self.world_T_cam, points, pinhole, self.size.image_size, self.config)
+        views = choose_views(frame, self.world_T_cam, points, *self.size.pinhole(self.intrinsics), self.config)
         if not views:
             return None
         other_T_cam = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]

@@ -23,8 +23,6 @@ class WorkingSize:
     width: int
     image_size: tuple[int, int]
     """(H, W), px."""
-    factor: float = 1.0
-    """Focal length of maps of this size over that of the shrunk images."""
 
     @property
     def plain(self) -> WorkingSize:
@@ -47,7 +45,11 @@ class WorkingSize:
         """Return fx, fy, cx, cy (4,) at this size."""
         x, y = self.scale
         fx, fy, cx, cy = intrinsics
-        return np.array([fx * x * self.factor, fy * y * self.factor, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5])
+        return np.array([fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5])
+
+    def pinhole(self, intrinsics: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
+        """Return intrinsics (4,) and size (height, width), px, of a pinhole that sees what the images show."""
+        return intrinsics, self.image_size
 
     def pixels(self, uv: FloatArray) -> FloatArray:
         """Return image pixels (N, 2) in working pixels."""

@@ -1,0 +1,75 @@
+"""Dense depth through a lens: frames are matched, and it is as good as through a pinhole."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from warping import warp_sequence
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.config.synthetic import SyntheticSceneConfig
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
+from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
+from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.optim.extension import find_extension
+from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.results.confidence_store import read_confidence
+from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.run_folder import RunFolder
+
+FRAMES = 14
+
+
+def bled(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A cue made of patches of eight pixels, whose disparity has a shift and a smooth error of 5 %."""
+    height, width = depth.shape
+    small = cv2.resize(depth, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
+    disparity = 1 / cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+    field = cv2.resize(rng.normal(0, 0.05, (5, 5)), (width, height), interpolation=cv2.INTER_CUBIC)
+    shift = rng.normal(0, 0.04) * np.median(disparity)
+    return np.asarray(np.exp(field) / (disparity + shift), np.float32)
+
+
+@pytest.fixture(scope="module")
+def straight() -> Sequence:
+    settings = {"num_frames": FRAMES, "height": 180, "width": 240, "focal": 150.0, "objects": "rigid", "seed": 4}
+    sequence = make_synthetic_sequence(SyntheticSceneConfig(**settings))
+    truth, rng = sequence.ground_truth, np.random.default_rng(4)
+    assert truth.depths is not None
+    assert truth.intrinsics is not None
+    cue = np.stack([bled(np.asarray(depth), rng) for depth in truth.depths])
+    return dataclasses.replace(sequence, depths=ArrayFrames(cue), intrinsics=truth.intrinsics)
+
+
+def fused(sequence: Sequence, folder: Path) -> tuple[float, float, int]:
+    """Static AbsRel, the part of the sure pixels that are right to 3 %, and how many frames were matched."""
+    config = load_config("default", ["output.clouds=false", "output.pictures=false", "input.intrinsics=fixed"])
+    stage = reconstruct(sequence, folder, config).stages["fusion"]
+    truth, masks = sequence.ground_truth.depths, sequence.masks
+    assert truth is not None
+    depth = np.stack(list(read_depth(RunFolder(folder).depth)))
+    sure = np.stack(list(read_confidence(RunFolder(folder).confidence, sequence.image_size))) > 0.9
+    true, static = np.stack(list(truth)), np.stack(list(masks)) == 0
+    ratio = true[static] / depth[static]
+    error = np.abs(np.median(ratio) / ratio - 1)
+    return float(error.mean()), float(np.mean(error[sure[static]] < 0.03)), stage["matched_frames"]
+
+
+@pytest.mark.skipif(find_extension()[0] is None, reason="needs the C++ extension")
+def test_depth_through_a_lens_is_as_good_as_through_a_pinhole(straight: Sequence, tmp_path: Path) -> None:
+    error, right, matched = fused(straight, tmp_path / "straight")
+    assert matched == FRAMES
+    for name, k1 in (("barrel", -0.12), ("pincushion", 0.05)):
+        lens = Lens("SIMPLE_RADIAL", (k1,))
+        intrinsics = straight.intrinsics
+        assert intrinsics is not None
+        bent = dataclasses.replace(warp_sequence(straight, intrinsics, lens), lens=lens)
+        found = fused(bent, tmp_path / name)
+        print(name, (error, right, matched), found, fused(dataclasses.replace(bent, lens=PINHOLE), tmp_path / "x"))
+        assert found[2] == FRAMES
+        assert found[0] < 1.1 * error
+        assert found[1] > right - 0.01
