@@ -110,7 +110,8 @@ def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_pa
 
 def test_a_fisheye_of_140_degrees(tmp_path: Path) -> None:
     sequence = scene(Lens("OPENCV_FISHEYE", (0.02, -0.005, 0.0, 0.0)), focal=131.0)
-    reconstruct(sequence, tmp_path, config("camera.model=opencv_fisheye"))
+    summary = reconstruct(sequence, tmp_path, config("camera.model=opencv_fisheye"))
+    assert "depth from several views is not made of images of so wide a lens" in summary.stages["fusion"]["facts"]
     found = evaluate_run(tmp_path, sequence).to_dict()["trajectory"]
     assert found["ate_m"] < 0.003 * found["path_length_reference_m"]
     assert load_reconstruction(RunFolder(tmp_path).reconstruction).intrinsics[0] == pytest.approx(131.0, rel=0.01)

@@ -55,7 +55,8 @@ class IdealSize(WorkingSize):
 
     def intrinsics(self, intrinsics: FloatArray) -> FloatArray:
         """Return fx, fy, cx, cy (4,) of these maps."""
-        return self.shrunk.intrinsics(intrinsics) + np.array([0.0, 0.0, *self.shift])
+        fx, fy, *center = self.shrunk.intrinsics(intrinsics)
+        return np.array([fx, fy, *(center + self.shift)])
 
     def pinhole(self, intrinsics: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
         """Return intrinsics (4,) and size (height, width), px, of a pinhole that sees what the images show."""
@@ -64,11 +65,14 @@ class IdealSize(WorkingSize):
     def pixels(self, uv: FloatArray) -> FloatArray:
         """Return image pixels (N, 2) in working pixels, ideal ones; far outside if no direction reaches them."""
         ideal = self.lens.ideal_pixels(self.camera, self.shrunk.pixels(uv))
-        return np.nan_to_num(ideal + self.shift, nan=-1e6)
+        return np.asarray(np.nan_to_num(ideal + self.shift, nan=-1e6))
 
     def shrink(self, values: Float32Array) -> Float32Array:
-        """Return a map (H, W) at this size; where the image does not reach, it goes on."""
-        return self.continued(_sampled(self.shrunk.shrink(values), self.to_real))
+        """Return a map (H, W) at this size, bicubic; where the image does not reach, it goes on."""
+        # Bilinear images are blurred, and matched worse.
+        small = self.shrunk.shrink(values)
+        bent = cv2.remap(small, self.to_real, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return self.continued(np.asarray(bent, np.float32))
 
     def depth(self, depth: Float32Array) -> Float32Array:
         """Return a depth map (H, W) at this size, as the plain one does; NaN where the image does not reach."""
