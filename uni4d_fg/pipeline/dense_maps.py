@@ -13,6 +13,7 @@ from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.optim.threads import OrderedMap
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.fusion.averaging import average_over_frames
+from uni4d_fg.results.fusion.background import Background, View, background
 from uni4d_fg.results.fusion.bleeding import bleeding_radius
 from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
@@ -80,6 +81,10 @@ class _Made(NamedTuple):
     log_cue: Float32Array
     """Before anything was done to it."""
     unmasked: BoolArray
+    static: BoolArray
+    """The same without a band around masks."""
+    color: Float32Array
+    """(h, w, 3) RGB, of 1; nothing where no frame is matched."""
 
 
 class _Judged(NamedTuple):
@@ -210,25 +215,48 @@ class DenseMaps:
             self.config.averaged_sigmas * float(np.clip(mine.depth.sigma, *_AVERAGED_SIGMA)),
         )
         averaged = averaged._replace(log_depth=self.size.continued(averaged.log_depth))
+        filled, still = averaged.log_depth, None
+        if self.prefers_matching and (mask > 0).any():
+            # Masks reach beyond what moves: what other frames see there just the same stands still.
+            behind = self._behind(frame)
+            still = self._still(frame, mask, behind)
+            shown = self.size.straight(still) & behind.seen & ~mine.unmasked
+            filled = np.where(shown, -np.log(np.where(shown, behind.inverse, np.float32(1))), filled)
         sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
         sure[~mine.unmasked & (mine.depth.matched <= STILL)] = 0
-        log_depth = self.size.shown(averaged.log_depth)
+        log_depth = self.size.shown(filled)
         if frame in self.broken or self.bleeding_px:
             full = np.exp(upsample_guided(log_depth, self.sequence.images[frame]))
             full[np.isnan(given)] = np.nan
         else:
-            full = lifted(averaged.log_depth, self.size.continued(mine.log_cue), given, self.size)
+            full = lifted(filled, self.size.continued(mine.log_cue), given, self.size)
         moving = mask > 0
         if moving.any():
-            # Masks reach beyond what moves: what other frames see there just the same stands still.
-            if frame in self.matched:
-                static = without_band(mine.unmasked, self.config.multiview.mask_band_px)
-                matched, static = self.size.shown(mine.depth.matched), self.size.shown(static)
-                still = stands_still(self.sequence.images[frame], mask, matched, static)
+            if still is not None:
                 moving &= self.size.plain.enlarge(still.astype(np.float32)) <= _HALF
             full[moving] = np.exp(self._moving(frame, given, mask)[moving])
         sure = self.size.shown(self.size.continued(sure))
         return full, FinalStatic(log_depth, sure, self.size.shown(mine.unmasked))
+
+    def _behind(self, frame: int) -> Background:
+        """Return what frames near one show of the still scene where it has masks."""
+        offsets = [offset for offset in self.config.averaged_offsets if offset > 1] or self.config.averaged_offsets
+        near = [frame + sign * offset for offset in offsets for sign in (-1, 1)]
+        others = (self._view(number) for number in near if 0 <= number < len(self.scene["world_T_cam"]))
+        return background(self._view(frame), others, self.size.within(~self._static(frame).unmasked, False))
+
+    def _still(self, frame: int, mask: Int32Array, behind: Background) -> BoolArray:
+        """Return which pixels inside masks stand still, as the shrunk image shows them."""
+        mine = self._static(frame)
+        matched, static = self.size.shown(mine.depth.matched), self.size.shown(mine.static)
+        color, variance, inverse = (self.size.shown(part) for part in behind[:3])
+        seen = Background(color, variance, inverse, self.size.shown(behind.seen))
+        return stands_still(self.sequence.images[frame], mask, matched, static, seen)
+
+    def _view(self, frame: int) -> View:
+        made = self._static(frame)
+        pose: FloatArray = self.scene["world_T_cam"][frame]
+        return View(made.color, made.inverse, made.static, pose, self._camera(frame))
 
     def landmarks_in(self, frame: int) -> tuple[FloatArray, FloatArray]:
         """Return where a frame shows landmarks, (N, 2) px of the shrunk image, and their log depth (N,)."""
@@ -301,7 +329,15 @@ class DenseMaps:
         fused = self._fused(frame, judged, measured)
         fused = replace(fused, log_depth=self.size.within(fused.log_depth, np.nan))
         with np.errstate(invalid="ignore"):
-            return _Made(fused, np.exp(-fused.log_depth), np.log(judged.cue), judged.unmasked)
+            inverse, log_cue = np.exp(-fused.log_depth), np.log(judged.cue)
+        return _Made(fused, inverse, log_cue, judged.unmasked, judged.static, self._color(frame))
+
+    def _color(self, frame: int) -> Float32Array:
+        """Return the image (h, w, 3), of 1; nothing where no frame is matched."""
+        if not self.prefers_matching:
+            return np.zeros((0, 0, 3), np.float32)
+        channels = self.sequence.images[frame].transpose(2, 0, 1).astype(np.float32) / np.float32(255)
+        return np.dstack([self.size.shrink(channel) for channel in channels])
 
     def _judged(self, frame: int, measured: Measured | None) -> _Judged:
         broken = frame in self.broken

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+import pytest
 
+from uni4d_fg.results.fusion.background import Background
 from uni4d_fg.results.fusion.mask_band import looks_moving, stands_still
 
 HEIGHT, WIDTH = 48, 64
@@ -27,23 +30,56 @@ def test_the_band_around_a_mask_that_is_too_small_looks_like_what_moves_and_the_
     assert not looks_moving(image.astype(np.uint8), np.zeros_like(mask), static).any()
 
 
-def test_the_rim_of_a_mask_that_is_too_large_stands_still_where_depth_and_colors_say_so(
-    rng: np.random.Generator,
+def seen_behind(image: np.ndarray, thing: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> Background:
+    """The wall, with noise, also behind the thing."""
+    wall = np.where(thing[..., None], np.roll(image, 30, axis=1), image) / 255
+    color = (wall + rng.normal(0, 0.02, wall.shape)).astype(np.float32)
+    return Background(color, np.full_like(color, 4e-4), np.full(seen.shape, 0.5, np.float32), seen)
+
+
+@pytest.fixture
+def thing() -> np.ndarray:
+    found = np.zeros((HEIGHT, WIDTH), bool)
+    found[12:38, 18:46] = True
+    return found
+
+
+@pytest.fixture
+def image(thing: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A thing before a wall."""
+    noisy = np.where(thing[..., None], [170, 70, 70], [80, 80, 140]) + rng.normal(0, 20, (HEIGHT, WIDTH, 3))
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("margin", [2, 4, 6])
+def test_what_a_mask_covers_besides_stands_still_where_other_frames_show_the_same(
+    margin: int, thing: np.ndarray, image: np.ndarray, rng: np.random.Generator
 ) -> None:
-    thing = np.zeros((HEIGHT, WIDTH), bool)
-    thing[12:38, 18:46] = True
-    image = np.where(thing[..., None], [190, 60, 50], [70, 80, 160]) + rng.normal(0, 25, (HEIGHT, WIDTH, 3))
-    image = np.clip(image, 0, 255).astype(np.uint8)
-    mask = np.zeros((HEIGHT, WIDTH), np.int32)
-    mask[8:42, 14:50] = 4
-    static = np.ones((HEIGHT, WIDTH), bool)
-    static[5:45, 11:53] = False
-    rim = (mask > 0) & ~thing
-    # As on scenes with truth: four tenths of the rim are shown with confidence, the rest and what moves are not.
-    matched = np.where(rim, rng.choice([0.9, 0.15], (HEIGHT, WIDTH), p=[0.4, 0.6]), 0.05).astype(np.float32)
-    found = stands_still(image, mask, matched, static)
-    assert found[rim].mean() > 0.9
-    assert found[thing].mean() < 0.02
-    # A mask that fits is left alone, whatever its colors.
-    unsure = np.minimum(matched, np.float32(0.15))
-    assert not stands_still(image, mask, unsure, static).any()
+    large = cv2.dilate(thing.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8))
+    static = cv2.dilate(large, np.ones((5, 5), np.uint8)) == 0
+    rim = (large > 0) & ~thing
+    seen = rng.random(thing.shape) < 0.8
+    matched = np.full(thing.shape, 0.1, np.float32)
+    found = stands_still(image, large.astype(np.int32), matched, static, seen_behind(image, thing, seen, rng))
+    assert found[rim & seen].mean() > 0.95
+    assert found[rim & ~seen].mean() > 0.7  # as their neighbors
+    assert found[thing].mean() < 0.05
+
+
+def test_a_mask_that_fits_is_left_alone(thing: np.ndarray, image: np.ndarray, rng: np.random.Generator) -> None:
+    behind = seen_behind(image, thing, np.ones_like(thing), rng)
+    static = cv2.dilate(thing.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    matched = np.full(thing.shape, 0.1, np.float32)
+    assert not stands_still(image, thing.astype(np.int32), matched, static, behind).any()
+    # What is matched with confidence stands still in any case.
+    matched[14:16, 20:40] = 0.9
+    found = stands_still(image, thing.astype(np.int32), matched, static, behind)
+    np.testing.assert_array_equal(found, matched > 0.6)
+
+
+def test_where_no_frame_sees_what_is_behind_nothing_is_told(thing: np.ndarray, image: np.ndarray) -> None:
+    nothing = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    behind = Background(nothing, nothing, nothing[..., 0], np.zeros_like(thing))
+    mask = cv2.dilate(thing.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(np.int32)
+    matched = np.full(thing.shape, 0.1, np.float32)
+    assert not stands_still(image, mask, matched, mask == 0, behind).any()

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray, Int32Array
+from uni4d_fg.results.fusion.background import Background
 
 _AROUND_PX = 4.0
 """Standard deviation of the window whose colors a pixel is compared with, working px."""
@@ -16,16 +17,19 @@ _NONE_AROUND = 0.01
 _WHOLE = 0.99
 STILL = 0.6
 """Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
-_RIM_PX = 2.0
-_RIM_STILL = 0.1
-"""A mask is too large if so much of its rim, that wide, stands still: of masks that fit, a fiftieth seems to."""
+_RIM_PX, _RIM_STILL, _MIN_RIM = 2, 0.5, 20
+"""A mask is too large if so much of its rim, that wide, looks like what is behind: of masks that fit 0 to 0.3 does, of
+others 0.6 to 1. With fewer pixels that others see, it is not told."""
 _REACH_PX = 6.0
+"""Colors of what moves are those farther inside, working px."""
+_FARTHEST_PX = 12
 """Masks that are too large reach no farther beyond what moves, working px."""
 _USUAL = 0.15
 """Nine tenths of the pixels that move have a confidence below 0.25."""
-_LARGEST_LIKELIHOOD = 4.0
-"""Neighboring colors are not as independent as their likelihood takes them to be."""
-_EVIDENCE = 1.5
+_LARGEST, _PER_COLOR, _PER_CONFIDENCE = 8.0, 0.3, 0.13
+"""Log likelihood ratio of colors at most, and what it and confidence count: fitted to scenes with truth."""
+_TRANSFER_NOISE = 2e-3
+"""Variance of colors that are looked up in other frames, of 1."""
 
 
 def looks_moving(image: ImageArray, mask: Int32Array, static: BoolArray) -> BoolArray:
@@ -45,17 +49,21 @@ def looks_moving(image: ImageArray, mask: Int32Array, static: BoolArray) -> Bool
     return ~static & (_log_likelihood(small, inside) > _log_likelihood(small, static))
 
 
-def stands_still(image: ImageArray, mask: Int32Array, matched: Float32Array, static: BoolArray) -> BoolArray:
+def stands_still(
+    image: ImageArray, mask: Int32Array, matched: Float32Array, static: BoolArray, behind: Background
+) -> BoolArray:
     """Return which pixels inside masks stand still, as masks reach beyond what moves.
 
-    What several frames show with confidence does. Where that is much of a mask's rim, the mask is too large, and the
-    pixels along it are judged by both their confidence and their colors, compared with those deeper inside and outside.
+    What several frames show with confidence does. Where the rim of a mask looks like what other frames show of the
+    still scene, the mask is too large. By how much is seen in how many pixels look so, the farther inside the fewer;
+    each is then judged by that share, by its own colors, and by its confidence.
 
     Args:
         image: (H, W, 3) RGB.
         mask: (H, W) 0 static.
         matched: (h, w) confidence in the depth that several frames show of what stands still.
         static: (h, w) neither masked nor in the band around masks.
+        behind: What other frames show of the still scene there.
 
     Returns:
         (h, w), whatever outside of masks.
@@ -65,16 +73,33 @@ def stands_still(image: ImageArray, mask: Int32Array, matched: Float32Array, sta
     if not inside.any():
         return still
     depth = cv2.distanceTransform(np.pad(inside.astype(np.uint8), 1, mode="edge"), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    rim = inside & (depth <= _RIM_PX)
     deep = inside & (depth > _REACH_PX)
-    if not rim.any() or not deep.any() or float(still[rim].mean()) < _RIM_STILL:
+    ring = np.ceil(depth).astype(np.int64)
+    along = inside & (ring <= _FARTHEST_PX)
+    seen = along & behind.seen
+    if not deep.any() or np.count_nonzero(seen & (ring <= _RIM_PX)) < _MIN_RIM:
         return still
-    with np.errstate(invalid="ignore"):
-        like_static = np.nan_to_num(_log_likelihood(small, static) - _log_likelihood(small, deep), nan=0.0)
-    like_static = np.clip(like_static, -_LARGEST_LIKELIHOOD, _LARGEST_LIKELIHOOD)
-    seen = 2 * np.log(np.maximum(matched, np.float32(1e-3)) / np.float32(_USUAL))
-    along = inside & (depth <= _REACH_PX)
-    return np.asarray(still | (along & (like_static + seen > _EVIDENCE)))
+    like_behind = _like_background(small, behind) - _log_likelihood(small, deep)
+    # Where nothing deeper inside is near, the colors say nothing.
+    told = seen & np.isfinite(like_behind)
+    like_behind = np.where(told, np.clip(like_behind, -_LARGEST, _LARGEST), np.float32(0))
+    if float((like_behind[seen & (ring <= _RIM_PX)] > 0).mean()) < _RIM_STILL:
+        return still
+    many = np.bincount(ring[seen], minlength=_FARTHEST_PX + 1) + 1.0
+    share = np.bincount(ring[seen & (like_behind > 0)], minlength=_FARTHEST_PX + 1) / many
+    share = np.clip(np.minimum.accumulate(np.append(1.0, share[1:])), 0.02, 0.98)
+    # Farther inside than the mask is too large, what looks like the scene behind only looks like it.
+    along &= ring <= np.count_nonzero(share >= _RIM_STILL)
+    odds = np.log(share / (1 - share))[np.minimum(ring, _FARTHEST_PX)]
+    confident = 2 * np.log(np.maximum(matched, np.float32(1e-3)) / np.float32(_USUAL))
+    return np.asarray(still | (along & (odds + _PER_COLOR * like_behind + _PER_CONFIDENCE * confident > 0)))
+
+
+def _like_background(image: Float32Array, behind: Background) -> Float32Array:
+    """Return the log likelihood (h, w) of an image (h, w, 3), of 1, if what other frames show is there."""
+    off = cv2.GaussianBlur(image - behind.color, (0, 0), 1.0)
+    variance = cv2.GaussianBlur(behind.variance, (0, 0), 1.0) + np.float32(_TRANSFER_NOISE)
+    return np.asarray(-0.5 * (off**2 / variance + np.log(variance)).sum(axis=2), np.float32)
 
 
 def _shrunk(image: ImageArray, mask: Int32Array, shape: tuple[int, ...]) -> tuple[Float32Array, BoolArray]:

@@ -173,7 +173,10 @@ def is_taken(
         return False
     if max(map(abs, candidate.lens.parameters), default=0.0) > _FAR * settings.parameter_prior_sigma:
         return False
-    if after_another or candidate.displacement_px < settings.sure_displacement * max(image_size):
+    unsure = candidate.displacement_px < settings.sure_displacement * max(image_size)
+    if unsure and not after_another and candidate.evidence < settings.min_evidence_unsure:
+        return False
+    if after_another or unsure:
         return candidate.held_out_gain > 0.0
     return candidate.held_out_gain >= -settings.max_held_out_loss
 
