@@ -204,9 +204,9 @@ def expected_shares(
         if moved:
             _motion(add)
         if plan.masks == "motion":
-            add("motion of tracks", 1.3, 0.25)
-            add("motion masks", 0.5, 0.6)
-            add("masks to disk", 0.1, 0.02)
+            add("motion of tracks", 0.8, 0.16)
+            add("motion masks", 0.25, 0.28)
+            add("masks to disk", 0.04, 0.01)
             if moved:
                 _motion(add)
     known = tracks is not None or not plan.is_given
@@ -227,8 +227,8 @@ def expected_shares(
 
 def _motion(add: Callable[[str, float, float], None]) -> None:
     """Add the tasks of depth from camera motion."""
-    add("starting views", 2.4, 0.1)
-    add("structure from motion", 0.7, 0.1)
-    add("focal lengths", 2.6, 0.15)
-    add("depth of moving things", 1.0, 0.2)
-    add("depth maps", 0.8, 0.3)
+    add("starting views", 1.0, 0.045)
+    add("structure from motion", 0.3, 0.05)
+    add("focal lengths", 0.7, 0.045)
+    add("depth of moving things", 0.22, 0.045)
+    add("depth maps", 0.12, 0.045)
