@@ -253,10 +253,7 @@ def save_npz(path: Path, /, **arrays: npt.ArrayLike) -> None:
     for name, array in plain.items():
         if array.dtype.hasobject:
             raise ValueError(f"{path}: {name!r} is an object array and cannot be saved without pickle")
-    with (
-        atomic_path(path) as temporary,
-        zipfile.ZipFile(temporary, "w") as archive,
-    ):
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in plain.items():
             entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED if _compresses(array) else zipfile.ZIP_STORED

@@ -28,11 +28,11 @@ from uni4d_fg.cues.moving_things import Sightings, place_moving
 from uni4d_fg.cues.start_doubts import start_doubts, start_summary
 from uni4d_fg.cues.structure.motion import Structure, rotations_only, structure_from_motion
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
-from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
+from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
-from uni4d_fg.optim.threads import map_in_order, thread_count, workers_in_order
+from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -256,15 +256,11 @@ def _place(
     standing, grids = [], []
     sightings = Sightings(tracks)
     reporter.begin("depth of moving things", video.num_frames)
-    with workers_in_order(thread_count()) as mapped:
-        for frame, grid in enumerate(mapped(depths.grid, list(range(video.num_frames)))):
-            if should_stop():
-                raise Cancelled("depth from motion stopped")
-            mask = video.masks[frame]
-            standing.append(ground_contact(mask, enlarged(grid, video.image_size), depths.config))
-            sightings.add(frame, mask)
-            grids.append(grid)
-            reporter.advance(frame + 1)
+    for frame, grid in enumerate(depths.all_grids(reporter, should_stop)):
+        mask = video.masks[frame]
+        standing.append(ground_contact(mask, enlarged(grid, video.image_size), depths.config))
+        sightings.add(frame, mask)
+        grids.append(grid)
     reporter.end()
     depths = replace(depths, grids=tuple(grids))
     contacts = smooth_over_time(standing, depths.config.contact_smoothing)

@@ -23,7 +23,6 @@ from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.frames import MaskFolder
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
-from uni4d_fg.optim.threads import thread_count, workers_in_order
 from uni4d_fg.progress import Reporter
 
 ShouldStop = Callable[[], bool]
@@ -96,14 +95,8 @@ def geometric_depth(
 def _grids(depths: FrameSource[Float32Array], reporter: Reporter, should_stop: ShouldStop) -> list[Float32Array]:
     """Return the grids from which depth of camera motion is interpolated, made on all threads."""
     assert isinstance(depths, InterpolatedDepths)
-    grids = []
     reporter.begin("depth maps", len(depths))
-    with workers_in_order(thread_count()) as mapped:
-        for grid in mapped(depths.grid, list(range(len(depths)))):
-            if should_stop():
-                raise Cancelled("depth from motion stopped")
-            grids.append(grid)
-            reporter.advance(len(grids))
+    grids = list(depths.all_grids(reporter, should_stop))
     reporter.end()
     return grids
 

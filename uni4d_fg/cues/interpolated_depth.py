@@ -8,7 +8,7 @@ of its mask, where it may touch the ground, or a smaller one (``moving_things.py
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import cv2
@@ -18,8 +18,11 @@ from scipy.spatial import cKDTree
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.triangle_grid import linear_on_grid
+from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.frames import LazyFrames
 from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.optim.threads import thread_count, workers_in_order
+from uni4d_fg.progress import Reporter
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,23 @@ class InterpolatedDepths(LazyFrames[Float32Array]):
     def grid(self, frame: int) -> Float32Array:
         """Return the static inverse depth of a frame on the grid of ``config.stride``."""
         return interpolate(self.points[frame], self.image_size, self.config.stride)
+
+    def all_grids(self, reporter: Reporter, should_stop: Callable[[], bool]) -> Iterator[Float32Array]:
+        """Yield :meth:`grid` of every frame, in their order, made on all threads.
+
+        Args:
+            reporter: Told the frames that the caller is done with.
+            should_stop: Polled before every frame.
+
+        Raises:
+            Cancelled: If ``should_stop`` turned true.
+        """
+        with workers_in_order(thread_count()) as mapped:
+            for frame, grid in enumerate(mapped(self.grid, list(range(len(self))))):
+                if should_stop():
+                    raise Cancelled("depth from motion stopped")
+                yield grid
+                reporter.advance(frame + 1)
 
     def _read(self, frame: int) -> Float32Array:
         inverse = self.static(frame)

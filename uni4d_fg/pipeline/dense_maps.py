@@ -206,11 +206,10 @@ class DenseMaps:
             return self._by_nearest_points(frame, given, mask), None
         mine = self._static(frame)
         poses: FloatArray = self.scene["world_T_cam"]
-        near = [frame + sign * offset for offset in self.config.averaged_offsets for sign in (-1, 1)]
         averaged = average_over_frames(
             mine.inverse,
             poses[frame],
-            ((self._static(n).inverse, poses[n], self._camera(n)) for n in near if 0 <= n < len(poses)),
+            ((self._static(n).inverse, poses[n], self._camera(n)) for n in self._near(frame)),
             self._camera(frame),
             self.config.averaged_sigmas * float(np.clip(mine.depth.sigma, *_AVERAGED_SIGMA)),
         )
@@ -238,12 +237,17 @@ class DenseMaps:
         sure = self.size.shown(self.size.continued(sure))
         return full, FinalStatic(log_depth, sure, self.size.shown(mine.unmasked))
 
+    def _near(self, frame: int) -> list[int]:
+        """Return the frames whose depth is averaged with that of a frame."""
+        near = (frame + sign * offset for offset in self.config.averaged_offsets for sign in (-1, 1))
+        return [number for number in near if 0 <= number < self.sequence.num_frames]
+
     def _behind(self, frame: int) -> Background:
         """Return what frames near one show of the still scene where it has masks."""
-        offsets = [offset for offset in self.config.averaged_offsets if offset > 1] or self.config.averaged_offsets
-        near = [frame + sign * offset for offset in offsets for sign in (-1, 1)]
-        others = (self._view(number) for number in near if 0 <= number < len(self.scene["world_T_cam"]))
-        return background(self._view(frame), others, self.size.within(~self._static(frame).unmasked, False))
+        # The frames next to it mostly have their masks in the same place.
+        near = [number for number in self._near(frame) if abs(number - frame) > 1] or self._near(frame)
+        masked = self.size.within(~self._static(frame).unmasked, False)
+        return background(self._view(frame), map(self._view, near), masked)
 
     def _still(self, frame: int, mask: Int32Array, behind: Background) -> BoolArray:
         """Return which pixels inside masks stand still, as the shrunk image shows them."""
@@ -260,8 +264,8 @@ class DenseMaps:
 
     def landmarks_in(self, frame: int) -> tuple[FloatArray, FloatArray]:
         """Return where a frame shows landmarks, (N, 2) px of the shrunk image, and their log depth (N,)."""
-        _, log_scale, log_cue = self._landmark_cues(frame)
-        return self.size.plain.pixels(self.control[frame].uv[self._usable(frame)]), log_scale + log_cue
+        mine, usable = self.control[frame], self._usable(frame)
+        return self.size.plain.pixels(mine.uv[usable]), mine.log_scale[usable] + np.log(mine.cue[usable])
 
     def _given(self, frame: int) -> Float32Array:
         """Return the cue (H, W), m, NaN where it is not a depth."""

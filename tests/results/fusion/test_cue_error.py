@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.results.fusion.bleeding import from_nearest
 from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.cue_error import (
     KnownDepth,
@@ -19,6 +18,7 @@ from uni4d_fg.results.fusion.cue_error import (
 from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.results.fusion.multiview.measured import Measured
 from uni4d_fg.results.fusion.static_depth import fuse_static, held_out_errors, known_depth, without_edges
+from uni4d_fg.results.nearest import from_nearest
 
 HEIGHT, WIDTH = 60, 80
 NOWHERE = np.zeros((HEIGHT, WIDTH), bool)

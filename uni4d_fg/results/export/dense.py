@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
@@ -12,6 +11,7 @@ from uni4d_fg.geometry.camera import camera_to_world, unproject
 from uni4d_fg.results.export.clouds import static_cloud
 from uni4d_fg.results.export.model import ExportJob
 from uni4d_fg.results.fusion.clouds import depth_edges, dilate
+from uni4d_fg.results.nearest import from_nearest
 from uni4d_fg.results.normals import cloud_normals, normal_map
 from uni4d_fg.results.run import Run
 
@@ -71,11 +71,6 @@ def hidden_pixels(run: Run, frame: int) -> BoolArray:
 
 def without_holes(inverse_depth: Float32Array, known: BoolArray) -> Float32Array:
     """Give every pixel that is not known the value of the nearest one (H, W) that is; 0 where none is."""
-    if known.all() or not known.any():
-        return np.where(known, inverse_depth, 0.0).astype(np.float32)
-    _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    value = np.zeros(int(labels.max()) + 1, dtype=np.float32)
-    value[labels[known]] = inverse_depth[known]
-    return np.asarray(value[labels])
+    if not known.any():
+        return np.zeros(known.shape, np.float32)
+    return from_nearest(inverse_depth, known).astype(np.float32)

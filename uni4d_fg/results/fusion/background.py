@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
-from uni4d_fg.results.fusion.bleeding import from_nearest
 from uni4d_fg.results.fusion.pixel_transfer import pixel_transfer
+from uni4d_fg.results.nearest import from_nearest
 
 _ONE_SURFACE = 0.15
 """Another frame whose log depth differs by more from what is continued from beside the mask shows something else."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array
 from uni4d_fg.results.fusion.log_range import log_range
+from uni4d_fg.results.nearest import from_nearest
 
 _EDGE = 0.15
 """Change of log depth over two pixels that is an edge."""
@@ -97,22 +98,3 @@ def mixing_sigma(log_cue: Float32Array, radius_px: float) -> Float32Array:
     again = cv2.GaussianBlur(padded, (0, 0), sigma)[margin : -margin or None, margin : -margin or None]
     change = np.log(np.maximum(again / inverse, _LEAST_RATIO))
     return np.asarray(_PER_CHANGE * np.sqrt(cv2.GaussianBlur(change**2, (0, 0), sigma)), np.float32)
-
-
-def from_nearest(values: Float32Array, known: BoolArray) -> Float32Array:
-    """Return a map (h, w) in which every pixel that is not known has the value of the nearest one that is.
-
-    Nothing is averaged: between two surfaces there is no third one.
-
-    Args:
-        values: (h, w).
-        known: (h, w).
-    """
-    if known.all() or not known.any():
-        return values
-    _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    value_of = np.zeros(int(labels.max()) + 1, dtype=np.float32)
-    value_of[labels[known]] = values[known]
-    return np.asarray(value_of[labels])

@@ -11,11 +11,12 @@ from scipy.special import erf
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.results.fusion.bleeding import across_edges, from_nearest, mixing_sigma
+from uni4d_fg.results.fusion.bleeding import across_edges, mixing_sigma
 from uni4d_fg.results.fusion.cue_error import CorrectedCue, KnownDepth, correct_cue
 from uni4d_fg.results.fusion.log_range import log_range
 from uni4d_fg.results.fusion.multiview.measured import Measured
 from uni4d_fg.results.fusion.wide_window import blurred
+from uni4d_fg.results.nearest import from_nearest
 
 _LANDMARK_SIGMA = 0.006
 """Standard deviation of a landmark's log depth in a frame."""

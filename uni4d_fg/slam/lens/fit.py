@@ -24,6 +24,7 @@ from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.lens.tracks import ideal_tracks, ideal_weight, unzoomed_tracks
+from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
@@ -276,9 +277,7 @@ def _errors(
 ) -> FloatArray:
     """Return the distance, px, of real pixels of observations (N,) from where points (N, 3) appear."""
     x = world_to_camera(fit.scene.cameras.world_T_cam[frame], points)
-    seen = np.asarray(project(fit.intrinsics, x))
-    if fit.zoom is not None:
-        center = fit.intrinsics[2:]
-        seen = center + np.exp(fit.zoom[frame])[:, None] * (seen - center)
-    real = fit.lens.real_pixels(fit.intrinsics, seen)
+    factor = None if fit.zoom is None else np.exp(fit.zoom)
+    seen = project(zoomed(fit.intrinsics, factor, len(fit.scene.cameras.world_T_cam))[frame], x)
+    real = fit.lens.real_pixels(fit.intrinsics, np.asarray(seen))
     return np.asarray(np.linalg.norm(real - tracks.tracks.uv[track, frame], axis=1))

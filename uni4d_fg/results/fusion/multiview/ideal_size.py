@@ -10,6 +10,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.results.fusion.multiview.working_frame import ONE_SURFACE, MapT, WorkingSize, on_one_surface
+from uni4d_fg.results.nearest import nearest_known
 
 _MOST_PIXELS = 3.0
 """A lens for which a pinhole needs more than this many times the pixels is not undone."""
@@ -148,7 +149,7 @@ def ideal_size(plain: WorkingSize, lens: Lens, intrinsics: FloatArray) -> Workin
         to_ideal=to_ideal,
         from_image=np.asarray(cv2.resize(to_ideal, full, interpolation=cv2.INTER_LINEAR), np.float32),
         inside=inside,
-        nearest=_nearest(inside),
+        nearest=nearest_known(inside),
     )
 
 
@@ -165,16 +166,6 @@ def _real(lens: Lens, camera: FloatArray, ideal: FloatArray, sides: tuple[int, i
         same = np.abs(lens.ideal_pixels(camera, real) - ideal).max(axis=-1) < _SAME_PX
     inside: BoolArray = same & (real > -0.5).all(axis=-1) & (real < last + 0.5).all(axis=-1)
     return np.where(inside[..., None], np.clip(real, 0, last), -1e4).astype(np.float32), inside
-
-
-def _nearest(inside: BoolArray) -> IntArray:
-    """Return the number of the nearest pixel that is inside, (h, w)."""
-    _, labels = cv2.distanceTransformWithLabels(
-        (~inside).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    number_of: IntArray = np.zeros(int(labels.max()) + 1, dtype=np.int64)
-    number_of[labels[inside]] = np.flatnonzero(inside)
-    return np.asarray(number_of[labels])
 
 
 def _sampled(values: Float32Array, at: Float32Array) -> Float32Array:
