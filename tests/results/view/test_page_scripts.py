@@ -120,3 +120,35 @@ def test_an_arrow_goes_by_a_frame_and_leaves_the_view_alone(finished_run: Path) 
         page.keyboard.down("ArrowUp")
         page.wait_for_function(f"Math.abs({place}[1] - {before[1]}) > 1e-3")
         page.keyboard.up("ArrowUp")
+
+
+_WATCH = """
+  const watch = () => {
+    const panel = document.body && document.querySelector("#root > *");
+    const visible = panel && getComputedStyle(panel).visibility === "visible";
+    if (visible) window.panelSince ??= [performance.now(), window.uni4dDetail?.seen ?? null];
+    setTimeout(watch, 5);
+  };
+  watch();
+"""
+
+
+@pytest.mark.parametrize("points_are_seen", [True, False])
+def test_the_panel_comes_with_the_first_points_or_after_three_seconds(
+    finished_run: Path, points_are_seen: bool
+) -> None:
+    port = free_port()
+    with viewer_server("127.0.0.1", port, "a run") as server:
+        viewer = Viewer(server, opened(finished_run))
+        viewer.load()
+        with browser_page(viewport={"width": 800, "height": 480}) as page:
+            if not points_are_seen:
+                # The script that would tell finds its work done and does nothing.
+                page.add_init_script("window.uni4dDetail = {}")
+            page.add_init_script(_WATCH)
+            page.set_default_timeout(1000.0 * PATIENCE_S)
+            page.goto(f"http://127.0.0.1:{port}")
+            page.get_by_text("Frames per second").wait_for()
+            milliseconds, seen = page.evaluate("window.panelSince")
+    assert seen is (True if points_are_seen else None) or milliseconds > 3000.0
+    assert points_are_seen or milliseconds > 3000.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from html import escape
 
 import numpy as np
@@ -19,9 +20,10 @@ from uni4d_fg.results.colors import (
     value_range,
 )
 from uni4d_fg.results.measures import pose_sigmas
-from uni4d_fg.results.residuals import landmark_sigma, reprojection_residuals
+from uni4d_fg.results.residuals import Residuals, landmark_sigma, reprojection_residuals
 from uni4d_fg.results.run import Run
 from uni4d_fg.results.run_clouds import ColoredPoints
+from uni4d_fg.slam.reconstruction import Reconstruction
 
 _DIMMED = 0.45
 _CAMERA = (88, 130, 190)
@@ -42,14 +44,22 @@ class Values:
 
     landmark_error: FloatArray
     """(N,) median reprojection error, px."""
-    landmark_sigma: FloatArray
-    """(N,) meters, from the rays alone; infinite where not determined, NaN without tracks."""
     trajectory_error: FloatArray
     """(M, T) reprojection residual, px; NaN where not observed."""
     position_sigma: FloatArray
     """(T,) meters; NaN where not known."""
     camera_error: FloatArray
     """(T,) median reprojection residual of the static points, px; NaN where not known."""
+    reconstruction: Reconstruction
+    residuals: Residuals | None
+    """Of all observations; None without tracks."""
+
+    @cached_property
+    def landmark_sigma(self) -> FloatArray:
+        """(N,) meters, from the rays alone; infinite where not determined, NaN without tracks. Takes a while."""
+        if self.residuals is None:
+            return np.full(len(self.landmark_error), np.nan)
+        return landmark_sigma(self.reconstruction, self.residuals)
 
 
 def values_of(run: Run) -> Values:
@@ -61,13 +71,12 @@ def values_of(run: Run) -> Values:
     error = reconstruction.landmark_error.astype(np.float64)
     trajectory_error = np.full(reconstruction.dynamic_observed.shape, np.nan)
     if run.labelled is None:
-        unknown = np.full(len(error), np.nan)
-        return Values(error, unknown, trajectory_error, position, np.full(num_frames, np.nan))
+        return Values(error, trajectory_error, position, np.full(num_frames, np.nan), reconstruction, None)
     residuals = reprojection_residuals(reconstruction, run.labelled)
     moving = residuals.is_dynamic
     trajectory_error[residuals.row[moving], residuals.frame[moving]] = residuals.norm[moving]
     per_camera = residuals.per_frame(num_frames, 0.5, dynamic=False)
-    return Values(error, landmark_sigma(reconstruction, residuals), trajectory_error, position, per_camera)
+    return Values(error, trajectory_error, position, per_camera, reconstruction, residuals)
 
 
 @dataclass(frozen=True)

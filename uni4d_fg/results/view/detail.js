@@ -16,19 +16,24 @@
   const TARGET_MS = 43, SOFTWARE_MS = 27, TOUCH_MS = 300, QUIET_MS = 800, STILL_FACTOR = 6, STILL_MOST = 20, LEFT_OUT = 9;
   const FEWEST = 6000, MOST = 2e7, SMALL = 3000, LARGEST_PX = 24, SMALLEST_PX = 6;
   const state = (window.uni4dDetail = {
-    budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false, circles: 0, software: null, moving: true,
+    budget: 60000, wanted: 0, drawn: 0, frames: 0, milliseconds: TARGET_MS, everything: false, circles: 0,
+    software: null, moving: true, seen: false,
   });
-  // Without a graphics card, smoothing of edges costs more than everything else; points have none.
+  // Without a graphics card, smoothing of edges costs more than everything else; points have none. What draws is asked
+  // of a canvas made for it, at once: making the first one takes software half a second, in which the page is read.
   const getContext = HTMLCanvasElement.prototype.getContext;
-  const rendererOf = (canvas) => {
-    const gl = getContext.call(canvas, "webgl2"), info = gl?.getExtension("WEBGL_debug_renderer_info");
-    const name = gl ? String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) : "";
-    gl?.getExtension("WEBGL_lose_context")?.loseContext();
-    return name;
+  let first = getContext.call(document.createElement("canvas"), "webgl2");
+  first?.flush();
+  const isSoftware = () => {
+    const info = first?.getExtension("WEBGL_debug_renderer_info");
+    const name = first ? String(first.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : first.RENDERER)) : "";
+    first?.getExtension("WEBGL_lose_context")?.loseContext();
+    first = null;
+    return /swiftshader|llvmpipe|software|basic render/i.test(name);
   };
   HTMLCanvasElement.prototype.getContext = function (kind, options, ...rest) {
     if (kind !== "webgl2" || !options?.antialias) return getContext.call(this, kind, options, ...rest);
-    state.software ??= /swiftshader|llvmpipe|software|basic render/i.test(rendererOf(document.createElement("canvas")));
+    state.software ??= isSoftware();
     return getContext.call(this, kind, { ...options, antialias: !state.software }, ...rest);
   };
 
@@ -104,6 +109,7 @@
   wrap("drawArrays", (inner) => function (mode, first, count) {
     noted(count);
     if (leftOut(this)) return;
+    state.seen ||= mode === this.POINTS;
     const places = mode === this.POINTS && count > SMALL && !state.everything && program && located.get(program);
     const [scale, view, projection] = places ? NAMES.map((name) => values.get(places[name])) : [];
     if (!scale || !view || !projection) return inner.call(this, mode, first, count);

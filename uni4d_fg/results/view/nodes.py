@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
+from uni4d_fg.optional import import_viser
 from uni4d_fg.results.chunks import Chunk, chunks_of
 from uni4d_fg.slam.reconstruction import Reconstruction
 
@@ -20,8 +20,8 @@ def vertical_fov(reconstruction: Reconstruction, frame: int) -> float:
 
 def quaternion(world_T_cam: FloatArray) -> FloatArray:
     """Return the orientation of a pose (4, 4) as a quaternion w, x, y, z."""
-    x, y, z, w = Rotation.from_matrix(world_T_cam[:3, :3]).as_quat().tolist()
-    return np.array([w, x, y, z])
+    wxyz: FloatArray = import_viser().transforms.SO3.from_matrix(world_T_cam[:3, :3]).wxyz
+    return wxyz
 
 
 def add_group(server: Any, name: str, *, visible: bool) -> Any:

@@ -2,6 +2,16 @@
 (() => {
   if (window.uni4dPage) return;
   window.uni4dPage = true;
+  const LONGEST_MS = 3000;
+  // The panel waits for the first points: without a graphics card, drawing it takes half a second.
+  const waits = document.createElement("style"), since = performance.now();
+  waits.textContent = "body :not(canvas) { visibility: hidden !important }";
+  document.head.append(waits);
+  const show = () => {
+    if (window.uni4dDetail?.seen || performance.now() - since > LONGEST_MS) waits.remove();
+    else setTimeout(show, 20);
+  };
+  show();
   document.addEventListener("DOMContentLoaded", () => {
     // viser's hotkeys listen at the document: a slider or a button that has the focus has used the key already.
     document.body.addEventListener("keydown", (event) => {
