@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.model import GroundTruth, Sequence
 from uni4d_fg.optim.threads import OrderedMap
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.fusion.averaging import average_over_frames
@@ -105,12 +106,43 @@ class _Judged(NamedTuple):
     errors: HeldOut
 
 
+@dataclass(frozen=True)
+class SomeControlPoints(SequenceOf[ControlPoints]):
+    """Those of some frames, by the numbers of all."""
+
+    start: int
+    some: list[ControlPoints]
+    num_frames: int
+
+    @classmethod
+    def of(cls, control: SequenceOf[ControlPoints], start: int, stop: int) -> SomeControlPoints:
+        """Take those of frames ``start`` to ``stop - 1``, as far as there are any."""
+        start, stop = max(start, 0), min(stop, len(control))
+        return cls(start, [control[frame] for frame in range(start, stop)], len(control))
+
+    def __len__(self) -> int:
+        return self.num_frames
+
+    @overload
+    def __getitem__(self, frame: int) -> ControlPoints: ...
+    @overload
+    def __getitem__(self, frame: slice) -> list[ControlPoints]: ...
+    def __getitem__(self, frame: int | slice) -> ControlPoints | list[ControlPoints]:
+        """Return those of a frame. Raises IndexError where they were left out."""
+        if isinstance(frame, slice):
+            return [self[number] for number in range(*frame.indices(self.num_frames))]
+        if not 0 <= frame - self.start < len(self.some):
+            raise IndexError(f"control points of frame {frame} were left out")
+        return self.some[frame - self.start]
+
+
 @dataclass
 class DenseMaps:
     """Dense depth of single frames, kept as long as frames near them need it; frames are asked for in order."""
 
     sequence: Sequence
-    control: list[ControlPoints]
+    control: SequenceOf[ControlPoints]
+    """Of every frame."""
     scene: Arrays
     config: FusionConfig
     intrinsics: FloatArray
@@ -138,6 +170,27 @@ class DenseMaps:
         poses: FloatArray = self.scene["world_T_cam"]
         self.multiview = MultiviewDepth(
             self._working_frame, self.size, self.intrinsics[0], poses, self._landmarks, multiview, self.threads
+        )
+
+    def apart(self, first: int, stop: int) -> DenseMaps:
+        """Return what makes the depth of frames ``first`` to ``stop - 1`` in another process, with one thread.
+
+        It is small: of control points it has those that these frames and the ones near them need, of frames none.
+        """
+        reach = max(self.config.averaged_offsets, default=0)
+        if self.broken:
+            reach = max(reach, _CARRIED_REACH) + _CARRIED_REACH
+        if not self.unmatched:
+            reach += max(self.config.multiview.compared_offsets, default=0)
+        return replace(
+            self,
+            sequence=replace(self.sequence, tracks=None, ground_truth=GroundTruth(), initial_world_T_cam=None),
+            control=SomeControlPoints.of(self.control, first - reach, stop + reach),
+            scene={name: self.scene[name] for name in ("world_T_cam", "log_scale", "noise")},
+            threads=1,
+            matched=set(),
+            made={},
+            measured={},
         )
 
     def try_matching(self) -> None:

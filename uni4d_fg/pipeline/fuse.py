@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray, ImageArray, IntArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.files import remove_file
@@ -20,13 +20,16 @@ from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
-from uni4d_fg.optim.threads import thread_count, workers_in_order
+from uni4d_fg.optim.threads import thread_count
 from uni4d_fg.pipeline.dense_maps import DenseMaps
+from uni4d_fg.pipeline.fuse_parts import can_be_sent, fuse_in_parts
+from uni4d_fg.pipeline.fused_frames import fused_frames
 from uni4d_fg.pipeline.landmark_sigma import landmark_shares
 from uni4d_fg.pipeline.steps import Arrays
+from uni4d_fg.pipeline.window_workers import WindowWorkers
 from uni4d_fg.progress import Reporter
-from uni4d_fg.results.confidence_store import write_confidence
-from uni4d_fg.results.depth_store import write_depth
+from uni4d_fg.results.confidence_store import ConfidenceWriter, write_confidence
+from uni4d_fg.results.depth_store import DepthWriter, write_depth
 from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.results.fusion.multiview.ideal_size import ideal_size
@@ -35,8 +38,7 @@ from uni4d_fg.results.fusion.told_error import ToldError
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import zoomed
 
-_FRAMES_PER_THREAD = 2
-"""Threads wait for each other once per as many frames."""
+_STOPPED = "stopped during fusion; finished stages are kept, --resume continues from them"
 
 
 def fuse_depth(
@@ -50,6 +52,7 @@ def fuse_depth(
     should_stop: Callable[[], bool],
     zoom: FloatArray | None = None,
     lens: Lens = PINHOLE,
+    workers: WindowWorkers | None = None,
 ) -> dict[str, Any]:
     """Write the fused depth of all frames, and how sure it is where static depth is made as a field.
 
@@ -64,6 +67,7 @@ def fuse_depth(
         should_stop: Polled before every frame.
         zoom: (T,) focal length of each frame over that of the record's intrinsics; None without a zoom.
         lens: Distortion of the images.
+        workers: Processes of this machine that make parts of the frames, if they can read them; the result is the same.
 
     Returns:
         What the summary says of it: ``facts``, ``warnings`` and ``broken_frames``.
@@ -104,20 +108,35 @@ def fuse_depth(
         sure = None
         if config.static == "field":
             sure = files.enter_context(write_confidence(folder.confidence, sequence.num_frames, working))
-        mapped = files.enter_context(workers_in_order(maps.threads))
-        together = _FRAMES_PER_THREAD * maps.threads
-        for first in range(0, sequence.num_frames, together):
-            frames = list(range(first, min(first + together, sequence.num_frames)))
-            maps.prepare(frames, mapped)
-            for frame, (depth, static) in zip(frames, mapped(maps.final, frames), strict=True):
-                if should_stop():
-                    raise Cancelled("stopped during fusion; finished stages are kept, --resume continues from them")
-                writer.write(frame, depth)
-                if sure is not None and static is not None:
-                    sure.write(static.confidence)
-                    told.add(static.log_depth, static.confidence, static.still, *maps.landmarks_in(frame))
-                reporter.advance(frame + 1)
+        if workers is not None and can_be_sent(maps):
+            _on_workers(maps, workers, writer, sure, told, reporter)
+            return _summary(maps, told)
+        for fused in fused_frames(maps, 0, sequence.num_frames):
+            if should_stop():
+                raise Cancelled(_STOPPED)
+            writer.write(fused.frame, fused.depth)
+            _note(sure, told, fused.confidence, fused.told)
+            reporter.advance(fused.frame + 1)
     return _summary(maps, told)
+
+
+def _on_workers(
+    maps: DenseMaps, workers: WindowWorkers, writer: DepthWriter, sure: ConfidenceWriter | None, told: ToldError,
+    reporter: Reporter,
+) -> None:  # fmt: skip
+    try:
+        for part in fuse_in_parts(maps, writer, workers, reporter.advance):
+            for number, of_frame in enumerate(part.told):
+                _note(sure, told, part.confidence[number] if part.confidence else None, of_frame)
+    except Cancelled as error:
+        raise Cancelled(_STOPPED) from error
+
+
+def _note(sure: ConfidenceWriter | None, told: ToldError, confidence: ImageArray | None, of_frame: ToldError) -> None:
+    """Keep how sure the next frame's depth is, and what is told of its error."""
+    if sure is not None and confidence is not None:
+        sure.write_steps(confidence)
+        told.follow(of_frame)
 
 
 def _unmatchable(config: FusionConfig, zoom: FloatArray | None, size: WorkingSize | None) -> str:

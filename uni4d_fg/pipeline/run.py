@@ -341,8 +341,6 @@ def _stages(
         with ExitStack() as stack:
             if run.options is not None:
                 stack.enter_context(thread_limit(run.options.threads))
-            if run.workers is not None:
-                stack.callback(run.workers.close)
             parts = WindowedRun(
                 sequence, labelled, windows, config, StageStore(run.store.folder / "windows"), run.resume, run_stage,
                 run.reporter, run.should_stop, run.workers,
@@ -467,11 +465,14 @@ def _fuse(
             run.should_stop,
             zoom,
             lens,
+            None if run.workers is None else run.workers.at_hand(),
         )
         return StageRecord({}, summary)
 
     run.written.wait()  # depth takes the most space: whether there is any, the small files should say
     run.step("fusion", key, compute, run.sequence.num_frames)
+    if run.workers is not None:
+        run.workers.close()
     run.written.wait()
 
 

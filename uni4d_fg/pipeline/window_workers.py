@@ -122,6 +122,10 @@ class WindowWorkers:
             self._opener.submit(self._stack.close).result()
             self._client = None
 
+    def at_hand(self) -> WindowWorkers | None:
+        """Return these workers if they are running on this machine, and so have its files and may do more."""
+        return self if self._client is not None and self.options.scheduler is None else None
+
     def start(self) -> None:
         """Start the processes, which takes seconds, while this one goes on."""
         if self._client is None:
@@ -168,7 +172,7 @@ class WindowWorkers:
         try:
             for index, outcome in spread(client, _call, calls, self.options, traces, self.should_stop):
                 if isinstance(outcome, Lost):
-                    raise SolverError(f"a window cannot be solved on the workers: {outcome.why}")
+                    raise SolverError(f"a part of the video cannot be solved on the workers: {outcome.why}")
                 if outcome.error is not None:
                     raise outcome.error
                 yield index, outcome

@@ -14,7 +14,7 @@ from typing import IO
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array
+from uni4d_fg.arrays import Float32Array, ImageArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npy, npy_stream
 from uni4d_fg.frontend.sequence.model import ArrayFrames
@@ -32,10 +32,19 @@ class ConfidenceWriter:
 
     def write(self, confidence: Float32Array) -> None:
         """Store the next map (h, w), 0 to 1. Raises ValueError if its size is not what was announced."""
-        if confidence.shape != self.size:
-            raise ValueError(f"a map of size {confidence.shape} does not fit {self.size}")
-        self.stream.write(np.rint(np.clip(confidence, 0, 1) * _STEPS).astype(np.uint8).tobytes())
+        self.write_steps(in_steps(confidence))
+
+    def write_steps(self, steps: ImageArray) -> None:
+        """Store the next map (h, w) as :func:`in_steps` gives it. Raises as :meth:`write`."""
+        if steps.shape != self.size:
+            raise ValueError(f"a map of size {steps.shape} does not fit {self.size}")
+        self.stream.write(steps.tobytes())
         self.written += 1
+
+
+def in_steps(confidence: Float32Array) -> ImageArray:
+    """Return a map (h, w) of 0 to 1 as it is stored, in 8 bits."""
+    return np.asarray(np.rint(np.clip(confidence, 0, 1) * _STEPS), dtype=np.uint8)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.errors import InputError
-from uni4d_fg.files import forget_pages, load_checksums, load_npy, npy_stream, write_checksums
+from uni4d_fg.files import forget_pages, load_checksums, load_npy, npy_stream, write_checksums, write_failure
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 
 
@@ -30,7 +30,7 @@ class DepthWriter:
     num_frames: int
     image_size: tuple[int, int]
     written: dict[int, int] = field(default_factory=dict)
-    """Frame to the checksum of its map."""
+    """Frame to the checksum of its map. Of frames that another process wrote, it says what they are."""
 
     def write(self, frame: int, depth: npt.NDArray[np.floating]) -> None:
         """Store one map (H, W), meters; values that are not positive and finite are stored as NaN.
@@ -48,6 +48,34 @@ class DepthWriter:
         self.stream.seek(self.start + frame * stored.nbytes)
         self.stream.write(stored.data)
         self.written[frame] = zlib.crc32(stored.data)
+
+    def place(self) -> DepthPlace:
+        """Return what another process of this machine needs to write some of the maps."""
+        self.stream.flush()
+        return DepthPlace(Path(self.stream.name), self.start, self.num_frames, self.image_size)
+
+
+@dataclass(frozen=True)
+class DepthPlace:
+    """A file of depth that is being written."""
+
+    path: Path
+    start: int
+    num_frames: int
+    image_size: tuple[int, int]
+
+    @contextmanager
+    def opened(self) -> Iterator[DepthWriter]:
+        """Write some of its maps; what :attr:`DepthWriter.written` then says, the file's own writer must be told.
+
+        Raises:
+            OutputError: If they cannot be written.
+        """
+        try:
+            with open(self.path, "rb+") as stream:
+                yield DepthWriter(stream, self.start, self.num_frames, self.image_size)
+        except OSError as error:
+            raise write_failure(self.path, error) from error
 
 
 @contextmanager

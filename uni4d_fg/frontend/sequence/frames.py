@@ -267,6 +267,10 @@ class FramesInTurn(LazyFrames[T]):
         self.source = source
         self._turn = threading.Lock()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what another process needs: no lock."""
+        return FramesInTurn, (self.source,)
+
     def __len__(self) -> int:
         return len(self.source)
 

@@ -74,6 +74,16 @@ class VideoFrames(LazyFrames[ImageArray]):
         self._block = max(_CACHED_FRAMES, _CACHED_BYTES // first.nbytes)
         self._length, self.times = self._look_through(stop)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs to open the file itself; what was found in it is not looked for again."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_lock", "_cache", "_capture")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Open the file. Raises InputError if it is gone."""
+        self.__dict__.update(state)
+        self._lock, self._cache, self._capture, self._last = threading.Lock(), OrderedDict(), cv2.VideoCapture(), -1
+        self._open()
+
     def _open(self) -> None:
         if check_regular(self.path, "a video file") == 0:
             raise SequenceProblem(self.path, "is empty", "copy it again")

@@ -58,6 +58,8 @@ def _local(distributed: Any, options: WorkerOptions, count: int, module: str | N
         "distributed.scheduler.allowed-failures": 0,
         # A worker that is started again is given up for good if it is not there by then; a busy machine takes long.
         "distributed.deploy.lost-worker-timeout": _RESTART,
+        # Tracks and landmarks of a part of a video are more than what Dask takes for a mistake.
+        "distributed.admin.large-graph-warning-threshold": "1 GB",
         **environment,
     }
     with (

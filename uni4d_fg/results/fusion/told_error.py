@@ -106,6 +106,13 @@ class ToldError:
         for number, found in enumerate(self.off):
             found.append(off[bins == number])
 
+    def follow(self, other: ToldError) -> None:
+        """Add what was collected of one frame after those that are here; frame by frame, sums have the same digits."""
+        self.pixels += other.pixels
+        self.expected += other.expected
+        for mine, found in zip(self.off, other.off, strict=True):
+            mine += found
+
     def mean(self) -> float | None:
         """Return the mean relative error to expect, scale apart; None if no pixel is static."""
         total = float(self.pixels.sum())
