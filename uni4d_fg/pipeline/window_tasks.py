@@ -71,6 +71,8 @@ class SceneItem:
     initial_world_T_cam: FloatArray | None
     timestamps: FloatArray
     config: Config
+    linearized: InformationItem
+    """How it is linearized where it was solved."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,8 @@ class InformationItem:
     windows: list[Window]
     index: int
     spans: TrackSpans
-    cameras: Cameras
-    is_first_round: bool
+    cameras: Cameras | None
+    """Joined; None to linearize it where it was solved."""
     log_scale_priors: bool
     config: Config
 
@@ -107,8 +109,8 @@ class MotionItem:
     config: Config
 
 
-def solve_window_scene(item: SceneItem, run: StageRunner, hooks: Hooks) -> None:
-    """Solve stages 1 and 2 of a window and write its record.
+def solve_window_scene(item: SceneItem, run: StageRunner, hooks: Hooks) -> WindowInformation:
+    """Solve stages 1 and 2 of a window, write its record, and linearize it there.
 
     Raises:
         DegenerateProblemError: If the cues do not determine the window's cameras.
@@ -122,17 +124,19 @@ def solve_window_scene(item: SceneItem, run: StageRunner, hooks: Hooks) -> None:
     )  # fmt: skip
     stop_if_cancelled(done, STOPPED)
     item.place.save(StageRecord(scene.arrays(), {"solves": [solve_dict(s) for s in done], "dropped": lost}))
+    # From its record, as when windows are taken over from it.
+    return window_information(item.linearized, run, hooks)
 
 
 def window_information(item: InformationItem, run: StageRunner, hooks: Hooks) -> WindowInformation:
-    """Linearize a window at the joined cameras; in the first round where it was solved.
+    """Linearize a window at the joined cameras, or where it was solved.
 
     Raises:
         InputError: If its record is gone.
         SolverError: If a factor is not finite.
     """
     scene = item.place.scene()
-    if not item.is_first_round:
+    if item.cameras is not None:
         scene = place(scene, item.cameras, item.config.bundle_adjustment, run)
     mine = owned(scene, item.spans, item.windows, item.index)
     return information(mine, item.windows, item.index, item.config, log_scale_priors=item.log_scale_priors)

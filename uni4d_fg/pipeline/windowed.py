@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,13 +45,15 @@ from uni4d_fg.progress import Reporter
 from uni4d_fg.slam.stages.bundle_adjustment import hold_metric_scale
 from uni4d_fg.slam.stages.scene import Cameras, unknown_covariances
 from uni4d_fg.slam.windows.added_terms import added_terms
-from uni4d_fg.slam.windows.join import Joined, chain, join
+from uni4d_fg.slam.windows.information import WindowInformation
+from uni4d_fg.slam.windows.join import Covariances, chain, join
 from uni4d_fg.slam.windows.motion import join_motion
 from uni4d_fg.slam.windows.plan import TrackSpans, Window, blend_weight, tracks_in
 from uni4d_fg.slam.windows.scene import WindowLandmarks, calibrate
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
+KeptT = TypeVar("KeptT")
 
 
 @dataclass(frozen=True)
@@ -69,47 +73,57 @@ class WindowedRun:
     workers: WindowWorkers | None = None
     """Where windows are solved at once; None: one after the other in this process."""
 
+    def places(self, name: str, key: str) -> list[Place]:
+        """Return where the windows' records of this name are: a window builds on the plan up to it."""
+        found = []
+        for window in self.windows:
+            key = stage_key(key, [window.start, window.stop])
+            found.append(Place(self.store, f"{name}_{window.start:06d}", key, window))
+        return found
+
     def solve_each(self, hooks: Hooks) -> SolveEach:
         """Return what solves independent windows."""
         return self.workers or InOrder(self.run, hooks)
 
     def records(
-        self, name: str, keys: list[str], make: Callable[[int, Place], ItemT],
-        solve: Callable[[ItemT, StageRunner, Hooks], None], hooks: Hooks,
-    ) -> list[Place]:  # fmt: skip
+        self, places: list[Place], make: Callable[[int, Place], ItemT],
+        solve: Callable[[ItemT, StageRunner, Hooks], ResultT], hooks: Hooks, keep: Callable[[StageRecord], KeptT],
+    ) -> tuple[list[KeptT], dict[int, ResultT]]:  # fmt: skip
         """Make sure that every window has its record: the stored one of the same key when resuming, else a new one.
 
         The last window is always solved: its factor graph is that of the step, and not part of the record.
 
         Args:
-            name: Of the records.
-            keys: Of the windows.
+            places: Of the records.
             make: Returns what a window is solved from.
             solve: Solves it and writes its record.
             hooks: Progress and cancellation.
+            keep: Returns what is needed of a record; they are read while other windows are solved.
+
+        Returns:
+            What is kept of each record, and what the solves of windows that had none returned.
 
         Raises:
             Cancelled: If the user interrupts; finished windows are kept.
             OutputError: If a record cannot be written.
+            InputError: If it is gone again.
         """
         windows = self.windows
-        places = [
-            Place(self.store, f"{name}_{window.start:06d}", key, window)
-            for window, key in zip(windows, keys, strict=True)
-        ]
         last = len(windows) - 1
-        left = [
-            index
-            for index, found in enumerate(places)
-            if not (self.resume and index < last and self.store.load(found.file, found.key) is not None)
-        ]
+        kept, results = dict[int, KeptT](), dict[int, ResultT]()
+        for index in range(last if self.resume else 0):
+            stored = self.store.load(places[index].file, places[index].key)
+            if stored is not None:
+                kept[index] = keep(stored)
+        left = [index for index in range(len(windows)) if index not in kept]
         items = MadeItems(left, lambda index: make(index, places[index]))
-        done = sum(len(window) for index, window in enumerate(windows) if index not in left)
-        for index, _ in self.solve_each(hooks)(solve, items):
-            window = windows[left[index]]
-            done += len(window)
-            self.reporter.advance(done, f"frames {window} of {windows[-1].stop}")
-        return places
+        done = sum(len(windows[index]) for index in kept)
+        for number, result in self.solve_each(hooks)(solve, items):
+            index = left[number]
+            results[index], kept[index] = result, keep(places[index].load())
+            done += len(windows[index])
+            self.reporter.advance(done, f"frames {windows[index]} of {windows[-1].stop}")
+        return [kept[index] for index in range(len(windows))], results
 
     def check_cancelled(self) -> None:
         """Stop if the user asked for it.
@@ -127,21 +141,29 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
     dropped, initial = Counter[str](), given_poses(windowed.sequence, config)
     key, intrinsics, intrinsics_covariance, solves = _calibration(windowed, key, hooks)
 
+    share = _Shared(windows, TrackSpans.of(labelled), not isinstance(windowed.run, AddingRunner), config)
+
     def item(index: int, place: Place) -> SceneItem:
         tracks = tracks_in(labelled, windows[index].frames)
-        return SceneItem(place, tracks, intrinsics, initial, windowed.sequence.timestamps, config)
+        times = windowed.sequence.timestamps
+        return SceneItem(place, tracks, intrinsics, initial, times, config, share.item(index, place, None))
 
-    places = windowed.records("scene", _keys(key, windows), item, solve_window_scene, hooks)
-    for place in places:
-        told = place.load().summary
-        solves += told["solves"]
-        dropped.update(told["dropped"])
-    joined = _join(windowed, places, intrinsics_covariance, hooks)
-    items = MadeItems(range(len(windows)), lambda i: LandmarksItem(places[i], joined.cameras, config))
-    parts = _in_order(windowed.solve_each(hooks)(window_landmarks, items))
+    places = windowed.places("scene", key)
+    told, known = windowed.records(places, item, solve_window_scene, hooks, _told)
+    for one in told:
+        solves += one.solves
+        dropped.update(one.dropped)
+    cameras = chain(windows, [one.cameras for one in told])
+    cameras, covariances = _join(windowed, share, places, known, cameras, intrinsics_covariance, hooks)
+    items = MadeItems(range(len(windows)), lambda i: LandmarksItem(places[i], cameras, config))
+    with ThreadPoolExecutor(1) as beside:
+        # While workers solve windows this process is idle.
+        made = None if windowed.workers is None else beside.submit(covariances)
+        parts = _in_order(windowed.solve_each(hooks)(window_landmarks, items))
+        found = covariances() if made is None else made.result()
     solves += [solve_dict(s) for part in parts for s in part.solves]
     dropped["landmark far from its neighbors"] = sum(part.dropped for part in parts)
-    arrays = _joined_arrays(windows, joined, parts)
+    arrays = _joined_arrays(windows, cameras, found, parts)
     count = int(sum(part.count.sum() for part in parts))
     summary = bundle_summary(windowed.sequence, labelled, arrays, count, dropped, solves)
     summary["facts"].append(f"{len(windows)} windows of {len(windows[0])} frames, joined {config.windows.rounds} times")
@@ -156,8 +178,9 @@ def motion_step(windowed: WindowedRun, scene: Arrays, key: str, hooks: Hooks) ->
         here = tracks_in(windowed.labelled, windows[index].frames)
         return MotionItem(place, here, scene_part(scene, windows[index], here.track), windowed.config)
 
-    places = windowed.records("motion", _keys(key, windows), item, solve_window_motion, hooks)
-    records = [place.load() for place in places]
+    records, _ = windowed.records(
+        windowed.places("motion", key), item, solve_window_motion, hooks, lambda record: record
+    )
     weights = [blend_weight(windows, i) for i in range(len(windows))]
     arrays = join_motion(windows, weights, [record.arrays for record in records])
     summary = _joined_summary(arrays, [record.summary for record in records])
@@ -166,13 +189,33 @@ def motion_step(windowed: WindowedRun, scene: Arrays, key: str, hooks: Hooks) ->
     return StageRecord(arrays, summary)
 
 
-def _keys(key: str, windows: list[Window]) -> list[str]:
-    """Return the key of every window's record: a window builds on the plan up to it."""
-    keys = []
-    for window in windows:
-        key = stage_key(key, [window.start, window.stop])
-        keys.append(key)
-    return keys
+@dataclass(frozen=True)
+class _Told:
+    """What is needed of the record of a window's static scene, but for its linearization."""
+
+    solves: list[dict[str, Any]]
+    dropped: dict[str, int]
+    cameras: Cameras
+
+
+def _told(record: StageRecord) -> _Told:
+    arrays, summary = record.arrays, record.summary
+    cameras = Cameras(arrays["world_T_cam"], arrays["intrinsics"], arrays["log_scale"])
+    return _Told(summary["solves"], summary["dropped"], cameras)
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """What all windows are linearized with."""
+
+    windows: list[Window]
+    spans: TrackSpans
+    log_scale_priors: bool
+    config: Config
+
+    def item(self, index: int, place: Place, cameras: Cameras | None) -> InformationItem:
+        """Return what a window is linearized from."""
+        return InformationItem(place, self.windows, index, self.spans, cameras, self.log_scale_priors, self.config)
 
 
 def _in_order(found: Iterable[tuple[int, ResultT]]) -> list[ResultT]:
@@ -200,31 +243,50 @@ def _calibration(
     return key, found.arrays["intrinsics"], found.arrays["covariance"], found.summary["solves"]
 
 
-def _join(windowed: WindowedRun, places: list[Place], intrinsics_covariance: FloatArray, hooks: Hooks) -> Joined:
-    """Join the windows' cameras in rounds; landmarks follow before each linearization but the first."""
-    config, windows = windowed.config, windowed.windows
-    spans = TrackSpans.of(windowed.labelled)
-    cameras = chain(windows, [place.scene().cameras for place in places])
-    rounds, adding = config.windows.rounds, isinstance(windowed.run, AddingRunner)
-    for number in range(rounds):
-        items = [
-            InformationItem(place, windows, index, spans, cameras, number == 0, not adding, config)
-            for index, place in enumerate(places)
-        ]
-        parts = _in_order(windowed.solve_each(hooks)(window_information, items))
-        added = added_terms(windowed.run, cameras, config) if isinstance(windowed.run, AddingRunner) else None
-        joined = join(parts, cameras, intrinsics_covariance, covariance=number == rounds - 1, added=added)
-        cameras = joined.cameras
+def _join(
+    windowed: WindowedRun, share: _Shared, places: list[Place], known: dict[int, WindowInformation], cameras: Cameras,
+    intrinsics_covariance: FloatArray, hooks: Hooks,
+) -> tuple[Cameras, Callable[[], Covariances]]:  # fmt: skip
+    """Join the windows' cameras in rounds; landmarks follow before each linearization but the first.
+
+    Args:
+        windowed: The run.
+        share: What windows are linearized with.
+        places: Of the windows' scenes.
+        known: Of windows that were solved just now, how they are linearized for the first round.
+        cameras: Where the first round starts.
+        intrinsics_covariance: (4, 4).
+        hooks: Progress and cancellation.
+
+    Returns:
+        The cameras, and what computes their covariances.
+    """
+    known = dict(known)
+    for number in range(windowed.config.windows.rounds):
+        left = [index for index in range(len(places)) if index not in known]
+        items = [share.item(index, places[index], cameras if number else None) for index in left]
+        for at, part in windowed.solve_each(hooks)(window_information, items):
+            known[left[at]] = part
+        parts = [known.pop(index) for index in range(len(places))]
+        added = added_terms(windowed.run, cameras, windowed.config) if isinstance(windowed.run, AddingRunner) else None
+        joined = join(parts, cameras, intrinsics_covariance, added)
+        cameras, covariances = joined.cameras, joined.covariances
         if added is not None:
+            covariances = partial(_given, joined.covariances())  # now: added variables move on
             added.keep(windowed.run)
         if added is None or not added.is_metric:
             cameras = Cameras.of(hold_metric_scale(cameras.state(np.zeros((0, 3)))))
-    return replace(joined, cameras=cameras)
+    return cameras, covariances
 
 
-def _joined_arrays(windows: list[Window], joined: Joined, parts: list[WindowLandmarks]) -> dict[str, npt.NDArray[Any]]:
+def _given(covariances: Covariances) -> Covariances:
+    return covariances
+
+
+def _joined_arrays(
+    windows: list[Window], cameras: Cameras, covariances: Covariances, parts: list[WindowLandmarks]
+) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of a stage 2 record; a landmark of several windows counts once, as the weighted mean."""
-    cameras = joined.cameras
     all_tracks = np.concatenate([part.track for part in parts])
     count = np.concatenate([part.count for part in parts]).astype(np.float64)
     track, row = np.unique(all_tracks, return_inverse=True)
@@ -239,7 +301,7 @@ def _joined_arrays(windows: list[Window], joined: Joined, parts: list[WindowLand
     noise = np.average(
         [[part.noise.reprojection_sigma_px, part.noise.depth_sigma] for part in parts], axis=0, weights=share
     )
-    pose_covariance, intrinsics_covariance = joined.pose_covariance, joined.intrinsics_covariance
+    pose_covariance, intrinsics_covariance = covariances
     if not np.isfinite(pose_covariance).all():
         pose_covariance, intrinsics_covariance = unknown_covariances(len(cameras.world_T_cam))
     return {

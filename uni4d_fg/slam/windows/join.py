@@ -15,10 +15,11 @@ Source: Ni, Steedly and Dellaert 2007, "Tectonic SAM: exact, out-of-core, submap
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.se3 import se3_log
@@ -36,15 +37,33 @@ _MAX_STEPS_ADDED = 50
 """With added factors, whose kernels are reweighted from step to step."""
 
 
+Covariances: TypeAlias = tuple[FloatArray, FloatArray]
+"""Of all poses (T, 6, 6), and of the intrinsics (4, 4)."""
+
+
 @dataclass(frozen=True)
 class Joined:
-    """The solution, and how sure it is."""
+    """The solution, and what says how sure it is."""
 
     cameras: Cameras
-    pose_covariance: FloatArray
-    """(T, 6, 6)."""
+    information: list[WindowInformation]
+    """Of every window."""
     intrinsics_covariance: FloatArray
-    """(4, 4)."""
+    """(4, 4) of the intrinsics that were given; zero for those that are known."""
+    added: AddedTerms | None = None
+
+    def covariances(self) -> Covariances:
+        """Return those of all poses (T, 6, 6) and of the intrinsics (4, 4), at the solution as it was found.
+
+        Raises:
+            SolverError: If the windows do not determine a camera.
+        """
+        free = _free_columns(self.cameras, self.added)
+        uncertain = np.diag(self.intrinsics_covariance) > 0
+        free[FRAME * len(self.cameras.world_T_cam) :][:SHARED] = uncertain
+        known, which = np.zeros((4, 4)), np.ix_(uncertain, uncertain)
+        known[which] = np.linalg.inv(self.intrinsics_covariance[which])
+        return joined_covariances(self.information, self.cameras, free, known, self.added)
 
 
 def chain(windows: list[Window], parts: list[Cameras]) -> Cameras:
@@ -74,8 +93,6 @@ def join(
     information: list[WindowInformation],
     start: Cameras,
     intrinsics_covariance: FloatArray,
-    *,
-    covariance: bool,
     added: AddedTerms | None = None,
 ) -> Joined:
     """Minimize the windows' energies, and those of added factors, together.
@@ -84,7 +101,6 @@ def join(
         information: Of every window.
         start: Where to start; its intrinsics stay.
         intrinsics_covariance: (4, 4) of these; zero for those that are known.
-        covariance: Whether to compute covariances; NaN otherwise.
         added: Factors on all frames that the windows do not know of; their own variables move along.
 
     Raises:
@@ -92,9 +108,7 @@ def join(
     """
     cameras, num_frames = start, len(start.world_T_cam)
     base = FRAME * num_frames + SHARED
-    free = np.ones(base, dtype=bool) if added is None else added.free
-    if added is None:
-        free[:6] = False
+    free = _free_columns(start, added)
     free[base - SHARED : base] = False
     for _ in range(_MAX_STEPS if added is None else _MAX_STEPS_ADDED):
         gradient, matrices = np.zeros(len(free)), []
@@ -115,13 +129,16 @@ def join(
             added.move(step)
         if np.abs(step).max() < _STEP_SIZE:
             break
-    if not covariance:
-        return Joined(cameras, np.full((num_frames, 6, 6), np.nan), np.full((4, 4), np.nan))
-    uncertain = np.diag(intrinsics_covariance) > 0
-    free[base - SHARED : base] = uncertain
-    known = np.zeros((4, 4))
-    known[np.ix_(uncertain, uncertain)] = np.linalg.inv(intrinsics_covariance[np.ix_(uncertain, uncertain)])
-    return Joined(cameras, *joined_covariances(information, cameras, free, known, added))
+    return Joined(cameras, information, intrinsics_covariance, added)
+
+
+def _free_columns(cameras: Cameras, added: AddedTerms | None) -> BoolArray:
+    """Return which columns are not held: without added factors, all but the pose of frame 0."""
+    if added is not None:
+        return added.free
+    free = np.ones(FRAME * len(cameras.world_T_cam) + SHARED, dtype=bool)
+    free[:6] = False
+    return free
 
 
 def _moved(cameras: Cameras, step: FloatArray) -> Cameras:
