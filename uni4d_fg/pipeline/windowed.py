@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -270,17 +269,12 @@ def _join(
         parts = [known.pop(index) for index in range(len(places))]
         added = added_terms(windowed.run, cameras, windowed.config) if isinstance(windowed.run, AddingRunner) else None
         joined = join(parts, cameras, intrinsics_covariance, added)
-        cameras, covariances = joined.cameras, joined.covariances
+        cameras = joined.cameras
         if added is not None:
-            covariances = partial(_given, joined.covariances())  # now: added variables move on
             added.keep(windowed.run)
         if added is None or not added.is_metric:
             cameras = Cameras.of(hold_metric_scale(cameras.state(np.zeros((0, 3)))))
-    return cameras, covariances
-
-
-def _given(covariances: Covariances) -> Covariances:
-    return covariances
+    return cameras, joined.covariances
 
 
 def _joined_arrays(
