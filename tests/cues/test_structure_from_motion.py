@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uni4d_fg.cues.structure.selection import spread_tracks
+from uni4d_fg.cues.structure.selection import picture_cells, spread_tracks
 from uni4d_fg.cues.structure.triangulation import RayBundle, inverse_depth_sigma, sound, triangulate
 from uni4d_fg.cues.structure.two_view import fit_rotation, parallax, relative_pose
 from uni4d_fg.geometry import se3
@@ -130,6 +130,25 @@ def test_points_come_out_alike_together_and_alone(rng: np.random.Generator) -> N
     none = triangulate(rays.select(np.zeros(120, dtype=bool)), 1.0)
     assert np.isnan(none.position).all()
     assert np.isnan(none.angle).all()
+
+
+def test_tracks_are_picked_one_after_the_other(rng: np.random.Generator) -> None:
+    first, length = rng.integers(0, 15, 900), rng.integers(1, 20, 900)
+    track = np.repeat(np.arange(900), length)
+    frame = np.concatenate([start + np.arange(count) for start, count in zip(first, length, strict=True)])
+    ones = np.ones(len(track))
+    uv = rng.uniform(0, 1, (len(track), 2)) * np.array([320.0, 240.0])
+    picked = spread_tracks(Observations(track, frame, uv, ones, ones), (240, 320), 300)
+    cells = [(frame * 1000 + picture_cells(uv, (240, 320)))[track == k] for k in range(900)]
+    wanted, filled, quota = set[int](), dict[int, int](), 1
+    while len(wanted) < 300:
+        for k in np.argsort(-length, kind="stable")[: np.count_nonzero(length >= 3)].tolist():
+            free = sum(filled.get(cell, 0) < quota for cell in cells[k].tolist())
+            if k not in wanted and len(wanted) < 300 and 2 * free >= length[k]:
+                wanted.add(k)
+                filled |= {cell: filled.get(cell, 0) + 1 for cell in cells[k].tolist()}
+        quota *= 2
+    assert set(np.unique(track[picked]).tolist()) == wanted
 
 
 def test_picked_tracks_cover_every_frame_and_both_sides(rng: np.random.Generator) -> None:

@@ -14,6 +14,7 @@ from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.structure.consensus import fundamental_matrix
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.selection import picture_cells
+from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.slam.stages.observations import Observations
 
 _CONFIDENCE = 0.999
@@ -38,14 +39,22 @@ def epipolar_outliers(
     tracks, row = observations.rows()
     cell = picture_cells(observations.uv, image_size)
     agreed, tested = np.zeros(len(tracks)), np.zeros(len(tracks))
-    for step in sorted({min(step, num_frames - 1) for step in config.epipolar_steps}):
-        stride = max(1, step // 2, (num_frames - step) // _PAIRS_PER_STEP)
-        for first in range(0, num_frames - step, stride):
-            a, b = common.between(first, first + step)
-            distance = _distances(observations.uv[a], observations.uv[b], cell[a], config)
-            if distance is not None:
-                tested[row[a]] += 1
-                agreed[row[a]] += distance <= config.epipolar_px
+    steps = sorted({min(step, num_frames - 1) for step in config.epipolar_steps})
+    pairs = [
+        (first, first + step)
+        for step in steps
+        for first in range(0, num_frames - step, max(1, step // 2, (num_frames - step) // _PAIRS_PER_STEP))
+    ]
+
+    def agreement(pair: tuple[int, int]) -> tuple[IntArray, BoolArray] | None:
+        a, b = common.between(*pair)
+        distance = _distances(observations.uv[a], observations.uv[b], cell[a], config)
+        return None if distance is None else (row[a], distance <= config.epipolar_px)
+
+    for found in map_in_order(agreement, pairs, thread_count()):
+        if found is not None:
+            tested[found[0]] += 1
+            agreed[found[0]] += found[1]
     return np.asarray((tested > 0) & (agreed < 0.5 * tested))
 
 

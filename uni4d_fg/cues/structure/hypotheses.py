@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -71,6 +71,8 @@ class Competition:
     config: Config
     free_focal: bool
     should_stop: Callable[[], bool]
+    picked: dict[tuple[int, ...], tuple[IntArray, Observations, BoolArray]] = field(default_factory=dict)
+    """What trials on the same frames share."""
 
     def run(self) -> list[Hypothesis]:
         """Try starts; return those that give a scene, the best first.
@@ -114,12 +116,8 @@ class Competition:
             raise Cancelled("structure from motion stopped")
         settings = self.config.geometric_depth
         frames = trial_frames(pair, self.num_frames, settings.trial_step, settings.trial_frames)
-        inside = np.isin(self.observations.frame, frames)
-        seen = self.observations.select(inside)
-        picked = spread_tracks(seen, self.image_size, settings.trial_tracks)
-        judged = seen.select(picked)
-        kept_out = held_out(judged, settings.held_out_every)
-        used = judged.select(~kept_out & self.chosen(part)[inside][picked])
+        chosen, judged, kept_out = self._picked(frames)
+        used = judged.select(~kept_out & self.chosen(part)[chosen])
         if len(used) == 0:
             return None
         scene = GrowingScene.empty(
@@ -141,6 +139,18 @@ class Competition:
         is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
         left = unexplained(scene, judged.select(kept_out), self.image_size)
         return Hypothesis(pair, factor, part, scene, frames, left, is_usual)
+
+    def _picked(self, frames: IntArray) -> tuple[IntArray, Observations, BoolArray]:
+        """Return the observations (n,) that trials on some frames use, in full as well, and which (n,) are held out."""
+        key = tuple(frames.tolist())
+        if key not in self.picked:
+            settings = self.config.geometric_depth
+            inside = np.flatnonzero(np.isin(self.observations.frame, frames))
+            seen = self.observations.select(inside)
+            chosen = inside[spread_tracks(seen, self.image_size, settings.trial_tracks)]
+            judged = self.observations.select(chosen)
+            self.picked[key] = chosen, judged, held_out(judged, settings.held_out_every)
+        return self.picked[key]
 
 
 def trial_frames(pair: FramePair, num_frames: int, steps: int, count: int) -> IntArray:
