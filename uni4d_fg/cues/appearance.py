@@ -22,7 +22,7 @@ from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.depth_range import DepthRange, depth_range
 from uni4d_fg.cues.guided_filter import sum_colors
-from uni4d_fg.cues.static_scene import predict_static
+from uni4d_fg.cues.static_scene import predict_static_at
 
 _MEDIAN_OF_SQUARE = 0.455
 """Of the square of a standard normal variable."""
@@ -42,6 +42,12 @@ class FrameAppearance:
     """Variance of the colors around, summed over them."""
     depth: DepthRange
     """With the frame's depth scale."""
+    z: Float32Array
+    """The depth itself."""
+    sigma_depth: Float32Array
+    """Standard deviation of log depth."""
+    variance: Float32Array
+    """Of a difference of colors, but for what an error of depth does."""
 
 
 def frame_appearance(
@@ -61,11 +67,16 @@ def frame_appearance(
     window = (config.contrast_window_px, config.contrast_window_px)
     variance = cv2.boxFilter(color * color, -1, window) - cv2.boxFilter(color, -1, window) ** 2
     scaled = depth * np.float32(np.exp(log_scale))
+    gxx, gyy = sum_colors(gx * gx), sum_colors(gy * gy)
+    around = depth_range(scaled, edge_window_px)
     return FrameAppearance(
         color,
-        (sum_colors(gx * gx), sum_colors(gx * gy), sum_colors(gy * gy)),
+        (gxx, sum_colors(gx * gy), gyy),
         sum_colors(np.maximum(variance, 0)),
-        depth_range(scaled, edge_window_px),
+        around,
+        np.exp(around.log_depth),
+        config.depth_sigma + 0.5 * around.spread,
+        3 * config.intensity_sigma**2 + config.prediction_sigma_px**2 * (gxx + gyy),
     )
 
 
@@ -88,27 +99,26 @@ def moved_evidence(
         config: Sigmas.
     """
     height, width = source.contrast.shape
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    static = predict_static(columns, rows, source.depth.log_depth, target_T_source, intrinsics)
+    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    static = predict_static_at(columns, rows, source.z, target_T_source, intrinsics)
     u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
     if shared is not None:
         u, v = u + shared[0], v + shared[1]
     inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
     seen = cv2.remap(target.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = source.color - seen
-    some = inside[::_SAMPLE, ::_SAMPLE]
+    sampled = (slice(None, None, _SAMPLE),) * 2
+    some = inside[sampled]
     if not some.any():
         return np.zeros((height, width), np.float32)
-    difference -= np.median(difference[::_SAMPLE, ::_SAMPLE][some], axis=0)  # exposure
+    difference -= np.median(difference[sampled][some], axis=0)  # exposure
     squared = cv2.boxFilter(sum_colors(difference * difference), -1, (config.patch_px, config.patch_px))
 
-    sigma_depth = config.depth_sigma + 0.5 * source.depth.spread
-    du, dv = sigma_depth * static.du, sigma_depth * static.dv
+    du, dv = source.sigma_depth * static.du, source.sigma_depth * static.dv
     gxx, gxy, gyy = source.gradient
-    variance = 3 * config.intensity_sigma**2 + config.prediction_sigma_px**2 * (gxx + gyy)
-    variance += du * du * gxx + 2 * du * dv * gxy + dv * dv * gyy
+    variance = source.variance + (du * du * gxx + 2 * du * dv * gxy + dv * dv * gyy)
     # Blur and noise of this pair of frames: most of the image is static.
-    variance *= max(1.0, float(np.median((squared / variance)[::_SAMPLE, ::_SAMPLE][some])) / _MEDIAN_OF_SQUARE)
+    variance *= max(1.0, float(np.median((squared[sampled] / variance[sampled])[some])) / _MEDIAN_OF_SQUARE)
     wider = variance + 2 * source.contrast
     evidence = 0.5 * (squared / variance - squared / wider - np.log(wider / variance))
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, IntArray
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.optim.threads import thread_count, workers_in_order
 
 _FAR = np.float32(1e3)
 UNKNOWN_RANGE = 2.0
@@ -64,12 +65,16 @@ def depth_range(depth: Float32Array, window_px: int) -> DepthRange:
 def spread_at_tracks(tracks: Tracks, depths: FrameSource[Float32Array], window_px: int) -> Float32Array:
     """Return the range of log depth around every observation, (K, T); :data:`UNKNOWN_RANGE` where not visible."""
     result = np.full(tracks.visible.shape, np.float32(UNKNOWN_RANGE))
-    for frame in range(tracks.num_frames):
+
+    def at_tracks(frame: int) -> tuple[IntArray, Float32Array]:
         seen = np.flatnonzero(tracks.visible[:, frame])
-        if len(seen) == 0:
-            continue
         spread = depth_range(depths[frame], window_px).spread
         column, row = np.floor(tracks.uv[seen, frame] + 0.5).astype(np.int64).T
         height, width = spread.shape
-        result[seen, frame] = spread[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        return seen, spread[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+
+    frames = np.flatnonzero(tracks.visible.any(axis=0)).tolist()
+    with workers_in_order(thread_count()) as mapped:
+        for frame, (seen, spread) in zip(frames, mapped(at_tracks, frames), strict=True):
+            result[seen, frame] = spread
     return result

@@ -29,11 +29,16 @@ class StaticPrediction:
     u: AnyFloat
     v: AnyFloat
     """Predicted pixel."""
-    log_z: AnyFloat
-    """Predicted log depth."""
+    z: AnyFloat
+    """Predicted depth."""
     du: AnyFloat
     dv: AnyFloat
     """Change of the predicted pixel per unit of log depth, px: the direction of the epipolar line."""
+
+    @property
+    def log_z(self) -> AnyFloat:
+        """Predicted log depth."""
+        return np.asarray(np.log(self.z))
 
 
 def predict_static(
@@ -48,9 +53,23 @@ def predict_static(
         target_T_source: (4, 4) pose of the source camera in the target camera.
         intrinsics: (4,) fx, fy, cx, cy, px.
     """
+    return predict_static_at(u, v, np.exp(log_depth), target_T_source, intrinsics)
+
+
+def predict_static_at(
+    u: AnyFloat, v: AnyFloat, z: AnyFloat, target_T_source: FloatArray, intrinsics: FloatArray
+) -> StaticPrediction:
+    """Do what :func:`predict_static` does, from depth itself.
+
+    Args:
+        u: Columns, px, of a shape that NumPy broadcasts to that of the depth.
+        v: Rows, px, likewise.
+        z: Depth.
+        target_T_source: (4, 4) pose of the source camera in the target camera.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+    """
     fx, fy, cx, cy = (np.float32(value) for value in intrinsics)
     rotation, shift = target_T_source[:3, :3].astype(np.float32), target_T_source[:3, 3].astype(np.float32)
-    z = np.exp(log_depth)
     x, y = (u - cx) / fx, (v - cy) / fy
     # The ray turned by R, times z, is also the derivative of the point by log z.
     ray = [(row[0] * x + row[1] * y + row[2]) * z for row in rotation]
@@ -60,7 +79,7 @@ def predict_static(
     return StaticPrediction(
         fx * a + cx,
         fy * b + cy,
-        np.log(depth),
+        depth,
         fx * (ray[0] / depth - a * slope),
         fy * (ray[1] / depth - b * slope),
     )
