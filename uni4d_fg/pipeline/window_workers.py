@@ -105,6 +105,7 @@ class WindowWorkers:
     _stack: ExitStack = field(default_factory=ExitStack)
     _opener: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
     _client: Future[Any] | None = None
+    _closed: Future[None] | None = None
 
     def __enter__(self) -> WindowWorkers:
         return self
@@ -114,13 +115,14 @@ class WindowWorkers:
     ) -> None:
         self.close()
         self._opener.shutdown()
+        if self._closed is not None:
+            self._closed.result()
 
     def close(self) -> None:
-        """End the processes; more than once does no harm."""
+        """End the processes, while this one goes on; more than once does no harm."""
         if self._client is not None:
             # By the thread that opened them: Dask's client is bound to it.
-            self._opener.submit(self._stack.close).result()
-            self._client = None
+            self._closed, self._client = self._opener.submit(self._stack.close), None
 
     def at_hand(self) -> WindowWorkers | None:
         """Return these workers if they are running on this machine, and so have its files and may do more."""

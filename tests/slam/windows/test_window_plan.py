@@ -43,6 +43,23 @@ def test_windows_cover_the_video_and_neighbors_share_the_overlap(sizes: tuple[in
     np.testing.assert_array_equal(middles, 1.0)
 
 
+@given(SIZES)
+def test_many_windows_are_an_even_number_and_hardly_shorter(sizes: tuple[int, int, int]) -> None:
+    overlap, more, num_frames = sizes
+    frames = 3 * overlap + more
+    windows = plan_windows(num_frames, frames, overlap)
+    fewest = max(-(-(num_frames - overlap) // (frames - overlap)), 1)
+    assert len(windows) == fewest if fewest < 5 else len(windows) == fewest + fewest % 2
+    assert max(map(len, windows)) - min(map(len, windows)) <= 1
+    assert len(windows) <= fewest * 6 / 5
+
+
+def test_a_thousand_frames_are_fourteen_windows() -> None:
+    windows = plan_windows(1000, 100, 20)
+    assert [len(windows), len(windows[0]), windows[-1].start] == [14, 90, 910]
+    assert [len(plan_windows(frames, 100, 20)) for frames in (100, 180, 260, 340, 341, 500)] == [1, 2, 3, 4, 6, 6]
+
+
 @given(SIZES, st.integers(0, 1000))
 def test_every_observation_has_one_owner(sizes: tuple[int, int, int], seed: int) -> None:
     overlap, more, num_frames = sizes

@@ -11,6 +11,9 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
 
+_MANY = 5
+"""Windows of which one more makes each hardly shorter."""
+
 
 @dataclass(frozen=True)
 class Window:
@@ -34,7 +37,8 @@ class Window:
 def plan_windows(num_frames: int, frames: int, overlap: int) -> list[Window]:
     """Return windows of equal length, at most ``frames``, of which neighbors share ``overlap`` frames.
 
-    No frame is in more than two windows.
+    No frame is in more than two windows. From :data:`_MANY` on their number is even: two workers, or four, then end
+    with them together, and the plan is the same however many there are.
 
     Raises:
         ConfigError: If the overlap is more than a third of the frames.
@@ -44,6 +48,7 @@ def plan_windows(num_frames: int, frames: int, overlap: int) -> list[Window]:
     if num_frames <= frames:
         return [Window(0, num_frames)]
     count = -(-(num_frames - overlap) // (frames - overlap))
+    count += count % 2 if count >= _MANY else 0
     starts = np.linspace(0, num_frames - overlap, count + 1).round().astype(int)[:-1]
     ends = np.append(starts[1:] + overlap, num_frames)
     return [Window(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
