@@ -13,7 +13,7 @@ from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.frontend.sequence.model import GroundTruth, Sequence
 from uni4d_fg.optim.threads import OrderedMap
 from uni4d_fg.pipeline.steps import Arrays
-from uni4d_fg.results.fusion.averaging import average_over_frames
+from uni4d_fg.results.fusion.averaging import Averaged, average_over_frames
 from uni4d_fg.results.fusion.background import Background, View, background
 from uni4d_fg.results.fusion.bleeding import bleeding_radius
 from uni4d_fg.results.fusion.carried import carried_depth
@@ -258,14 +258,7 @@ class DenseMaps:
         if self.config.static == "nearest_points":
             return self._by_nearest_points(frame, given, mask), None
         mine = self._static(frame)
-        poses: FloatArray = self.scene["world_T_cam"]
-        averaged = average_over_frames(
-            mine.inverse,
-            poses[frame],
-            ((self._static(n).inverse, poses[n], self._camera(n)) for n in self._near(frame)),
-            self._camera(frame),
-            self.config.averaged_sigmas * float(np.clip(mine.depth.sigma, *_AVERAGED_SIGMA)),
-        )
+        averaged = self._averaged(frame)
         averaged = averaged._replace(log_depth=self.size.continued(averaged.log_depth))
         filled, still = averaged.log_depth, None
         if self.prefers_matching and (mask > 0).any():
@@ -289,6 +282,35 @@ class DenseMaps:
             full[moving] = np.exp(self._moving(frame, given, mask)[moving])
         sure = self.size.shown(self.size.continued(sure))
         return full, FinalStatic(log_depth, sure, self.size.shown(mine.unmasked))
+
+    def _averaged(self, frame: int) -> Averaged:
+        """Average a frame's static depth with that of the frames near it.
+
+        In a frame without a cue of its own, what it is made of errs where other frames have moving things, and at
+        borders that few views see: of its depth and of what was carried into it, that counts with which more of the
+        other frames agree, where they have no masks.
+        """
+        mine = self._static(frame)
+        averaged = self._over_others(frame, mine.inverse)
+        if frame not in self.broken:
+            return averaged
+        carried = self._over_others(frame, np.exp(-self.size.within(mine.depth.corrected.log_depth, np.nan)))
+        agreed = carried.alike > averaged.alike
+        return Averaged(*(np.where(agreed, b, a) for a, b in zip(averaged, carried, strict=True)))
+
+    def _over_others(self, frame: int, inverse: Float32Array) -> Averaged:
+        """Average inverse depth (h, w), 1/m, in a frame with that of the frames near it."""
+        poses: FloatArray = self.scene["world_T_cam"]
+        near = self._near(frame)
+        made = [self._static(number) for number in near]
+        maps = [np.where(m.unmasked, m.inverse, np.float32(np.nan)) if frame in self.broken else m.inverse for m in made]
+        return average_over_frames(
+            inverse,
+            poses[frame],
+            zip(maps, poses[near], map(self._camera, near), strict=True),
+            self._camera(frame),
+            self.config.averaged_sigmas * float(np.clip(self._static(frame).depth.sigma, *_AVERAGED_SIGMA)),
+        )
 
     def _near(self, frame: int) -> list[int]:
         """Return the frames whose depth is averaged with that of a frame."""
@@ -377,7 +399,7 @@ class DenseMaps:
             measured = self.measured.pop(frame) if frame in self.measured else self.multiview.at(frame)
         judged = self._judged(frame, measured)
         # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
-        if not (self._counts_here(judged.errors) if frame in self.broken else self.prefers_matching):
+        if not (self.prefers_matching or (frame in self.broken and self._counts_here(judged.errors))):
             measured = None
         if measured is not None:
             self.matched.add(frame)
