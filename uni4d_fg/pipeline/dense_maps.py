@@ -42,6 +42,8 @@ from uni4d_fg.results.fusion.upsampling import upsample_guided
 _CARRIED_REACH, _CARRIED_FROM = 6, 2
 """A frame without a cue takes the depth of this many frames at most this far away."""
 _BESIDE = tuple(range(1, _CARRIED_REACH + 1))
+_ITS_OWN = 1
+"""What is carried agrees with the frame that it comes from: so many more others must."""
 _AVERAGED_SIGMA = (0.005, 0.06)
 """Bounds of the standard deviation from which it is told which frames agree."""
 _SHARP_PX = 4.0
@@ -286,16 +288,15 @@ class DenseMaps:
     def _averaged(self, frame: int) -> Averaged:
         """Average a frame's static depth with that of the frames near it.
 
-        In a frame without a cue of its own, what it is made of errs where other frames have moving things, and at
-        borders that few views see: of its depth and of what was carried into it, that counts with which more of the
-        other frames agree, where they have no masks.
+        In a frame without a cue of its own, matching alone errs at borders that few views see, and beside edges: where
+        more of the other frames agree with what was carried into it, that counts. Masked pixels agree with nothing.
         """
         mine = self._static(frame)
         averaged = self._over_others(frame, mine.inverse)
         if frame not in self.broken:
             return averaged
         carried = self._over_others(frame, np.exp(-self.size.within(mine.depth.corrected.log_depth, np.nan)))
-        agreed = carried.alike > averaged.alike
+        agreed = carried.alike > averaged.alike + _ITS_OWN
         return Averaged(*(np.where(agreed, b, a) for a, b in zip(averaged, carried, strict=True)))
 
     def _over_others(self, frame: int, inverse: Float32Array) -> Averaged:
@@ -398,7 +399,8 @@ class DenseMaps:
         if not self.unmatched:
             measured = self.measured.pop(frame) if frame in self.measured else self.multiview.at(frame)
         judged = self._judged(frame, measured)
-        # Where landmarks say that the corrected cue is the better one, matches would only add their noise.
+        # Where landmarks say that the corrected cue is the better one, matches would only add their noise. They were
+        # used for what is carried into a broken frame, and cannot speak against matching there once it is the choice.
         if not (self.prefers_matching or (frame in self.broken and self._counts_here(judged.errors))):
             measured = None
         if measured is not None:
