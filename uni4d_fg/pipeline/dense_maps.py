@@ -304,7 +304,9 @@ class DenseMaps:
         poses: FloatArray = self.scene["world_T_cam"]
         near = self._near(frame)
         made = [self._static(number) for number in near]
-        maps = [np.where(m.unmasked, m.inverse, np.float32(np.nan)) if frame in self.broken else m.inverse for m in made]
+        maps = [other.inverse for other in made]
+        if frame in self.broken:
+            maps = [np.where(other.unmasked, other.inverse, np.float32(np.nan)) for other in made]
         return average_over_frames(
             inverse,
             poses[frame],
@@ -399,8 +401,8 @@ class DenseMaps:
         if not self.unmatched:
             measured = self.measured.pop(frame) if frame in self.measured else self.multiview.at(frame)
         judged = self._judged(frame, measured)
-        # Where landmarks say that the corrected cue is the better one, matches would only add their noise. They were
-        # used for what is carried into a broken frame, and cannot speak against matching there once it is the choice.
+        # Where landmarks say that the corrected cue is the better one, matches would only add their noise. What is
+        # carried into a broken frame was corrected by them before: they do not speak against matching there.
         if not (self.prefers_matching or (frame in self.broken and self._counts_here(judged.errors))):
             measured = None
         if measured is not None:
