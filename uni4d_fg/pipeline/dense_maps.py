@@ -13,7 +13,7 @@ from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.frontend.sequence.model import GroundTruth, Sequence
 from uni4d_fg.optim.threads import OrderedMap
 from uni4d_fg.pipeline.steps import Arrays
-from uni4d_fg.results.fusion.averaging import Averaged, average_over_frames
+from uni4d_fg.results.fusion.averaging import Averaged, average_over_frames, chosen_by_others
 from uni4d_fg.results.fusion.background import Background, View, background
 from uni4d_fg.results.fusion.bleeding import bleeding_radius
 from uni4d_fg.results.fusion.carried import carried_depth
@@ -42,8 +42,6 @@ from uni4d_fg.results.fusion.upsampling import upsample_guided
 _CARRIED_REACH, _CARRIED_FROM = 6, 2
 """A frame without a cue takes the depth of this many frames at most this far away."""
 _BESIDE = tuple(range(1, _CARRIED_REACH + 1))
-_ITS_OWN = 1
-"""What is carried agrees with the frame that it comes from: so many more others must."""
 _AVERAGED_SIGMA = (0.005, 0.06)
 """Bounds of the standard deviation from which it is told which frames agree."""
 _SHARP_PX = 4.0
@@ -288,32 +286,25 @@ class DenseMaps:
     def _averaged(self, frame: int) -> Averaged:
         """Average a frame's static depth with that of the frames near it.
 
-        In a frame without a cue of its own, matching alone errs at borders that few views see, and beside edges: where
-        more of the other frames agree with what was carried into it, that counts. Masked pixels agree with nothing.
+        What is made of a frame without a cue gives way to what was carried into it, where other frames choose that.
         """
         mine = self._static(frame)
         averaged = self._over_others(frame, mine.inverse)
         if frame not in self.broken:
             return averaged
         carried = self._over_others(frame, np.exp(-self.size.within(mine.depth.corrected.log_depth, np.nan)))
-        agreed = carried.alike > averaged.alike + _ITS_OWN
-        return Averaged(*(np.where(agreed, b, a) for a, b in zip(averaged, carried, strict=True)))
+        return chosen_by_others(averaged, carried)
 
     def _over_others(self, frame: int, inverse: Float32Array) -> Averaged:
         """Average inverse depth (h, w), 1/m, in a frame with that of the frames near it."""
         poses: FloatArray = self.scene["world_T_cam"]
-        near = self._near(frame)
+        near, broken = self._near(frame), frame in self.broken
         made = [self._static(number) for number in near]
-        maps = [other.inverse for other in made]
-        if frame in self.broken:
-            maps = [np.where(other.unmasked, other.inverse, np.float32(np.nan)) for other in made]
+        maps = [np.where(m.unmasked, m.inverse, np.float32(np.nan)) if broken else m.inverse for m in made]
         return average_over_frames(
-            inverse,
-            poses[frame],
-            zip(maps, poses[near], map(self._camera, near), strict=True),
-            self._camera(frame),
+            inverse, poses[frame], zip(maps, poses[near], map(self._camera, near), strict=True), self._camera(frame),
             self.config.averaged_sigmas * float(np.clip(self._static(frame).depth.sigma, *_AVERAGED_SIGMA)),
-        )
+        )  # fmt: skip
 
     def _near(self, frame: int) -> list[int]:
         """Return the frames whose depth is averaged with that of a frame."""

@@ -7,7 +7,12 @@ import pytest
 
 from uni4d_fg.geometry import se3
 from uni4d_fg.optim.extension import find_extension
-from uni4d_fg.results.fusion.averaging import average_over_frames, compare_frames_numpy
+from uni4d_fg.results.fusion.averaging import (
+    Averaged,
+    average_over_frames,
+    chosen_by_others,
+    compare_frames_numpy,
+)
 
 K = np.array([160.0, 150.0, 79.5, 59.5])
 HEIGHT, WIDTH = 120, 160
@@ -145,3 +150,12 @@ def test_bad_input_is_named(wrong: dict[str, object], message: str) -> None:
     }  # fmt: skip
     with pytest.raises(ValueError, match=message):
         core.compare_frames(**(given | wrong))
+
+
+def test_carried_depth_counts_where_two_more_frames_show_the_same() -> None:
+    zero, many = np.zeros((1, 4), np.float32), np.full((1, 4), 8, np.float32)
+    own = Averaged(zero, zero, many, np.array([[2, 2, 2, 0]], np.float32))
+    carried = Averaged(zero + 1, zero, many, np.array([[2, 3, 4, 1]], np.float32))
+    chosen = chosen_by_others(own, carried)
+    assert chosen.log_depth.tolist() == [[0, 0, 1, 0]]
+    assert chosen.alike.tolist() == [[2, 2, 4, 0]]

@@ -23,6 +23,8 @@ from uni4d_fg.results.fusion.pixel_transfer import pixel_transfer
 
 _ALIKE = 0.03
 """Log depths that differ by less are the same."""
+_ITS_OWN = 1
+"""Carried depth agrees with the frame that it comes from: so many more others must."""
 
 
 class Averaged(NamedTuple):
@@ -70,6 +72,19 @@ def average_over_frames(
     else:
         product, *counts = core.compare_frames(inverse_depth, maps, *where, agree=agree, alike=alike, threads=threads)
     return Averaged(np.log(product) / (counts[0] + 1) - np.log(inverse_depth), *counts)
+
+
+def chosen_by_others(own: Averaged, carried: Averaged) -> Averaged:
+    """Take depth that was carried into a frame where more of the other frames show the same than what is its own.
+
+    Matching is wrong at borders that few views see, and blurs edges, which what is carried may have sharper.
+
+    Args:
+        own: What the frame is taken to show.
+        carried: What frames beside it show of it.
+    """
+    more = carried.alike > own.alike + _ITS_OWN
+    return Averaged(*(np.where(more, b, a) for a, b in zip(own, carried, strict=True)))
 
 
 def compare_frames_numpy(
