@@ -12,6 +12,7 @@ void bind_patch_registration(nb::module_& module);
 void bind_plane_sweep(nb::module_& module);
 void bind_frame_comparison(nb::module_& module);
 void bind_guided_upsampling(nb::module_& module);
+void bind_triangulation(nb::module_& module);
 }  // namespace uni4d_fg
 
 NB_MODULE(_core, module) {
@@ -19,7 +20,7 @@ NB_MODULE(_core, module) {
   // Objects that outlive the interpreter's own clean-up (in a failed test, say) are no reason to print.
   nb::set_leak_warnings(false);
   // Raised by every new entry point and every change of a signature or of a meaning.
-  module.attr("ABI") = 5;
+  module.attr("ABI") = 6;
   uni4d_fg::bind_factor_types(module);
   uni4d_fg::bind_whitening(module);
   uni4d_fg::bind_pair_system(module);
@@ -29,4 +30,5 @@ NB_MODULE(_core, module) {
   uni4d_fg::bind_plane_sweep(module);
   uni4d_fg::bind_frame_comparison(module);
   uni4d_fg::bind_guided_upsampling(module);
+  uni4d_fg::bind_triangulation(module);
 }

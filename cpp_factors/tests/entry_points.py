@@ -24,6 +24,8 @@ class EntryPoint:
     make: Callable[[np.random.Generator], dict[str, Any]]
     negative: tuple[str, ...] = ()
     """Float arguments for which a negative value must be refused."""
+    open_values: tuple[str, ...] = ()
+    """Float arguments that may have values that are not finite: they are missing."""
 
 
 def _noise(rng: np.random.Generator, count: int) -> dict[str, Any]:
@@ -74,6 +76,35 @@ ENTRY_POINTS["compare_frames"] = EntryPoint(
     lambda **a: _core.compare_frames(np.ones((4, 5), np.float32), [np.ones((4, 5), np.float32)] * 2, **a),
     lambda rng: {"turns": rng.normal(size=(2, 3, 3)), "shifts": rng.normal(size=(2, 3)), "agree": 1.1, "alike": 1.1},
 )
+
+
+def _rays(rng: np.random.Generator) -> dict[str, Any]:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(4, 3))
+    return {
+        "row": np.array([0, 0, 1, 1, 2]),
+        "frame": np.array([0, 3, 1, 2, 0]),
+        "uv": rng.uniform(0, 600, (5, 2)),
+        "world_T_cam": poses,
+        "intrinsics": rng.uniform(200, 900, 4),
+    }
+
+
+def _points(rng: np.random.Generator) -> dict[str, Any]:
+    return {**_rays(rng), "position": rng.normal(size=(3, 3)) + np.array([0.0, 0.0, 5.0])}
+
+
+_REFINING = {"huber_px": 1.0, "steps": 3, "converged": 1e-5, "ridge": 1e-9}
+ENTRY_POINTS |= {
+    "ray_equations": EntryPoint(lambda **arguments: _core.ray_equations(**arguments, tracks=3), _rays),
+    "refine_points": EntryPoint(
+        lambda **arguments: _core.refine_points(**arguments, **_REFINING),
+        lambda rng: {**_points(rng), "origin": rng.normal(size=(4, 3))},
+        open_values=("position",),
+    ),
+    "ray_angles": EntryPoint(_core.ray_angles, _points, open_values=("position",)),
+    "reprojection_errors": EntryPoint(_core.reprojection_errors, _points, open_values=("position",)),
+}
 
 
 def _pairs(rng: np.random.Generator) -> dict[str, Any]:

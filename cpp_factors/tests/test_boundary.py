@@ -88,6 +88,9 @@ def test_malformed_arrays_are_refused_by_name(name: str, data: st.DataObject, se
         message = refusal(entry.call, arguments)
         assert message is None or any(n in message for n in arrays)
         return
+    if kind == "value" and argument in entry.open_values:
+        entry.call(**arguments)
+        return
     with pytest.raises((ValueError, TypeError)) as caught:
         entry.call(**arguments)
     assert argument in str(caught.value), str(caught.value)

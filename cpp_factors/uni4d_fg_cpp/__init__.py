@@ -3,7 +3,8 @@
 Everything is in the compiled module ``_core``: ``factor_types`` lists the factor types that have a kernel,
 ``residual`` and ``linearize`` run one by its name, ``whiten`` and ``robust_energy`` apply noise and robust kernels,
 the systems solve the stages, ``register_patches`` finds patches in an image, ``plane_sweep`` matches views,
-``compare_frames`` compares their depth and ``upsample_guided`` brings it to the size of the image. Arrays are float64
+``compare_frames`` compares their depth, ``upsample_guided`` brings it to the size of the image, and ``ray_equations``,
+``refine_points``, ``ray_angles`` and ``reprojection_errors`` find points from rays and judge them. Arrays are float64
 (row numbers int64, maps float32, images uint8) and C-contiguous; a ValueError or TypeError names the argument that is
 not.
 """
@@ -18,7 +19,11 @@ from uni4d_fg_cpp._core import (
     factor_types,
     linearize,
     plane_sweep,
+    ray_angles,
+    ray_equations,
+    refine_points,
     register_patches,
+    reprojection_errors,
     residual,
     robust_energy,
     upsample_guided,
@@ -35,7 +40,11 @@ __all__ = [
     "factor_types",
     "linearize",
     "plane_sweep",
+    "ray_angles",
+    "ray_equations",
+    "refine_points",
     "register_patches",
+    "reprojection_errors",
     "residual",
     "robust_energy",
     "upsample_guided",

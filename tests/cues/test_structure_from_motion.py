@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from uni4d_fg.cues.structure import triangulation
 from uni4d_fg.cues.structure.selection import picture_cells, spread_tracks
 from uni4d_fg.cues.structure.triangulation import RayBundle, inverse_depth_sigma, sound, triangulate
 from uni4d_fg.cues.structure.two_view import fit_rotation, parallax, relative_pose
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.slam.stages.observations import Observations
 
 K = np.array([300.0, 300.0, 159.5, 119.5])
@@ -130,6 +132,35 @@ def test_points_come_out_alike_together_and_alone(rng: np.random.Generator) -> N
     none = triangulate(rays.select(np.zeros(120, dtype=bool)), 1.0)
     assert np.isnan(none.position).all()
     assert np.isnan(none.angle).all()
+
+
+def test_extension_and_numpy_find_the_same_points(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    core, reason = find_extension()
+    if core is None:
+        pytest.skip(reason)
+    poses = np.stack([moved(tuple(rng.normal(0, 0.05, 3)), tuple(rng.normal(0, 0.3, 3))) for _ in range(7)])
+    points, _, _ = views(rng, poses[1], 600)
+    points[:40, 2] *= -1.0  # behind the cameras
+    uv = np.stack([project(K, world_to_camera(pose, points)) for pose in poses]) + rng.normal(0, 0.5, (7, 600, 2))
+    uv[3, 50:90] += 40.0
+    whole = bundle(points, poses, uv)
+    # In any order, and with tracks of which nothing is seen.
+    some = rng.permutation(len(whole.row))[: len(whole.row) // 3]
+    for rays in (whole, RayBundle(whole.row[some], poses, whole.frame[some], whole.uv[some], K, 601)):
+        found = {}
+        for name in ("C++", "NumPy"):
+            with monkeypatch.context() as patch:
+                if name == "NumPy":
+                    patch.setattr(triangulation, "find_extension", lambda: (None, ""))
+                at = triangulate(rays, 1.0)
+                near = np.where(np.isfinite(at.position), at.position, 5.0) + np.array([0.0, 0.0, 0.01])
+                near[-3:] = np.nan
+                others = triangulation.ray_angles(rays, near), triangulation.reprojection_errors(rays, near)
+                found[name] = (at.position, at.information, at.angle, at.error_px, *others)
+        assert np.isfinite(found["C++"][0]).all(axis=1).mean() > 0.6
+        assert np.isnan(found["C++"][0]).any()
+        for fast, slow in zip(found["C++"], found["NumPy"], strict=True):
+            np.testing.assert_allclose(fast, slow, rtol=1e-9, atol=1e-12)
 
 
 def test_tracks_are_picked_one_after_the_other(rng: np.random.Generator) -> None:

@@ -13,14 +13,13 @@ from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
-from uni4d_fg.cues.structure.triangulation import RayBundle, ray_angles, sound, triangulate
+from uni4d_fg.cues.structure.triangulation import RayBundle, ray_angles, reprojection_errors, sound, triangulate
 from uni4d_fg.cues.structure.two_view import relative_pose
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
 from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.geometry import se3
-from uni4d_fg.geometry.camera import NEAR_PLANE, project, seen_from
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.stage import Stage, run_stage
@@ -234,13 +233,8 @@ class GrowingScene:
         frame, uv = observations.frame, observations.uv
         if some is not None:
             frame, uv, row = frame[some], uv[some], row[some]
-        x = seen_from(self.world_T_cam, frame, self.position[row])
-        with np.errstate(invalid="ignore"):
-            off = uv - project(self.intrinsics, x)
-            error = np.hypot(off[:, 0], off[:, 1])
-            usable = np.isfinite(error) & (x[:, 2] > NEAR_PLANE)
-        result: FloatArray = np.where(usable, error, np.inf)
-        return result
+        rays = RayBundle(row, self.world_T_cam, frame, uv, self.intrinsics, self.num_tracks)
+        return reprojection_errors(rays, self.position)
 
     def _judge(self, changed: IntArray | None = None) -> None:
         """Tell which observations agree with their point, of all or of those (n,) for which it may have changed."""

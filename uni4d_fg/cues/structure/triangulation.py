@@ -6,12 +6,14 @@ the standard deviation of the inverse depth in each frame:
 
     sigma(1/z) = sigma(z) / z^2.
 
-The inverse depth of a far point is known well even where its depth is not.
+The inverse depth of a far point is known well even where its depth is not. With the C++ extension all but the start is
+done there, with the same operations in the same order.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from uni4d_fg.geometry.camera import (
     seen_from,
     world_to_camera,
 )
+from uni4d_fg.optim.extension import find_extension
+from uni4d_fg.optim.threads import thread_count
 
 _STEPS = 8
 _RIDGE = 1e-9
@@ -48,6 +52,19 @@ class RayBundle:
     """(4,) px."""
     count: int
     """Number of tracks M."""
+
+    def arrays(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
+        """Return what the extension takes of them: track, camera and pixel of each, poses, intrinsics."""
+        return (
+            np.ascontiguousarray(self.row), np.ascontiguousarray(self.frame), np.ascontiguousarray(self.uv),
+            np.ascontiguousarray(self.world_T_cam), np.ascontiguousarray(self.intrinsics),
+        )  # fmt: skip
+
+    def origins(self) -> FloatArray:
+        """Return the world's origin (T, 3) in the cameras."""
+        rotation = self.world_T_cam[:, :3, :3].swapaxes(1, 2)
+        origin: FloatArray = -(rotation @ self.world_T_cam[:, :3, 3:])[:, :, 0]
+        return origin
 
     def select(self, keep: BoolArray) -> RayBundle:
         """Return the rays with ``keep`` (N,), of the same M tracks."""
@@ -89,19 +106,40 @@ def triangulate(rays: RayBundle, huber_px: float) -> Points:
         rays: What the frames see.
         huber_px: Reprojection errors above this count less, px.
     """
-    matrix, right = _nearest_to_all(rays)
-    # Parallel rays leave one direction open: the smallest eigenvalue is about (angle)^2 / 2.
-    solvable = np.linalg.eigvalsh(matrix)[:, 0] > _RIDGE
-    position = np.full((rays.count, 3), np.nan)
-    position[solvable] = np.linalg.solve(matrix[solvable], right[solvable][..., None])[..., 0]
-    position, information = _refine(rays, position, huber_px)
+    core, _ = find_extension()
+    return _triangulate_numpy(rays, huber_px) if core is None else _triangulate_cpp(core, rays, huber_px)
+
+
+def _triangulate_numpy(rays: RayBundle, huber_px: float) -> Points:
+    """Do what ``cpp_factors/src/triangulation.cpp`` does."""
+    position, information = _refine(rays, _start(*_nearest_to_all(rays)), huber_px)
     x = seen_from(rays.world_T_cam, rays.frame, position[rays.row])
     with np.errstate(invalid="ignore"):
         behind = np.bincount(rays.row, ~(x[:, 2] > NEAR_PLANE), rays.count) > 0
     position[behind] = np.nan
     off = rays.uv - project(rays.intrinsics, x)
     error = np.where(behind[rays.row], np.nan, np.hypot(off[:, 0], off[:, 1]))
-    return Points(position, information, ray_angles(rays, position), median_per_row(error, rays.row, rays.count))
+    angle = _ray_angles_numpy(rays, position)
+    return Points(position, information, angle, median_per_row(error, rays.row, rays.count))
+
+
+def _triangulate_cpp(core: Any, rays: RayBundle, huber_px: float) -> Points:
+    arrays = rays.arrays()
+    start = _start(*core.ray_equations(*arrays, tracks=rays.count))
+    found = core.refine_points(
+        *arrays, np.ascontiguousarray(rays.origins()), start, huber_px=huber_px, steps=_STEPS, converged=_CONVERGED,
+        ridge=_RIDGE, threads=thread_count(),
+    )  # fmt: skip
+    return Points(*found)
+
+
+def _start(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the points (M, 3) nearest to all rays of a track, NaN where these are parallel."""
+    # Parallel rays leave one direction open: the smallest eigenvalue is about (angle)^2 / 2.
+    solvable = np.linalg.eigvalsh(matrix)[:, 0] > _RIDGE
+    position = np.full((len(matrix), 3), np.nan)
+    position[solvable] = np.linalg.solve(matrix[solvable], right[solvable][..., None])[..., 0]
+    return position
 
 
 def sound(points: Points, max_error_px: float, min_angle_deg: float) -> BoolArray:
@@ -117,6 +155,29 @@ def ray_angles(rays: RayBundle, position: FloatArray) -> FloatArray:
 
     The angle between the first camera and the one farthest from it in angle: at least half of the largest.
     """
+    core, _ = find_extension()
+    if core is None:
+        return _ray_angles_numpy(rays, position)
+    found: FloatArray = core.ray_angles(*rays.arrays(), np.ascontiguousarray(position))
+    return found
+
+
+def reprojection_errors(rays: RayBundle, position: FloatArray) -> FloatArray:
+    """Return the reprojection error (N,) px of points (M, 3) along their rays; infinite without a point or behind."""
+    core, _ = find_extension()
+    if core is not None:
+        found: FloatArray = core.reprojection_errors(*rays.arrays(), np.ascontiguousarray(position))
+        return found
+    x = seen_from(rays.world_T_cam, rays.frame, position[rays.row])
+    with np.errstate(invalid="ignore"):
+        off = rays.uv - project(rays.intrinsics, x)
+        error = np.hypot(off[:, 0], off[:, 1])
+        usable = np.isfinite(error) & (x[:, 2] > NEAR_PLANE)
+    result: FloatArray = np.where(usable, error, np.inf)
+    return result
+
+
+def _ray_angles_numpy(rays: RayBundle, position: FloatArray) -> FloatArray:
     if len(rays.row) == 0:
         return np.full(rays.count, np.nan)
     away = [rays.world_T_cam[:, a, 3][rays.frame] - position[:, a][rays.row] for a in range(3)]
@@ -227,7 +288,7 @@ class _Views:
         used = np.flatnonzero(local[rays.row] >= 0)
         frame = rays.frame[used]
         rotation = rays.world_T_cam[:, :3, :3].swapaxes(1, 2)
-        origin = -(rotation @ rays.world_T_cam[:, :3, 3:])[:, :, 0]
+        origin = rays.origins()
         columns = np.empty((14, len(used)))
         for k in range(9):
             columns[k] = rotation[:, k // 3, k % 3][frame]
