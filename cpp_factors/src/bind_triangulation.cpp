@@ -47,10 +47,11 @@ std::pair<FloatArray, FloatArray> equations(const AnyArray& row, const AnyArray&
   return {matrix.release(), right.release()};
 }
 
-std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> refined(
-    const AnyArray& row, const AnyArray& frame, const AnyArray& uv, const AnyArray& world_T_cam,
-    const AnyArray& intrinsics, const AnyArray& origin, const AnyArray& position, double huber_px, int steps, double converged, double ridge,
-    int threads) {
+std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> refined(const AnyArray& row, const AnyArray& frame,
+                                                                   const AnyArray& uv, const AnyArray& world_T_cam,
+                                                                   const AnyArray& intrinsics, const AnyArray& origin,
+                                                                   const AnyArray& position, double huber_px, int steps,
+                                                                   double converged, double ridge, int threads) {
   const View<double> start = expect_floats(position, "position", {kAnyLength, 3}, false);
   const int tracks = expect_count(start.rows(), "position");
   Seen seen = expect_rays(row, frame, uv, world_T_cam, intrinsics, tracks);
@@ -58,7 +59,8 @@ std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> refined(
   if (!(huber_px > 0.0)) refuse("huber_px: expected a positive number");
   if (steps < 0 || !(converged >= 0.0) || !(ridge >= 0.0)) refuse("steps, converged, ridge: expected 0 or more");
   const int workers = expect_threads(threads);
-  NewArray point({sized(tracks), 3}), information({sized(tracks), 3, 3}), angle({sized(tracks)}), error({sized(tracks)});
+  NewArray point({sized(tracks), 3}), information({sized(tracks), 3, 3}), angle({sized(tracks)}),
+      error({sized(tracks)});
   std::copy(start.data, start.data + start.size(), point.data());
   {
     nb::gil_scoped_release release;
@@ -96,16 +98,18 @@ FloatArray errors(const AnyArray& row, const AnyArray& frame, const AnyArray& uv
 }  // namespace
 
 void bind_triangulation(nb::module_& module) {
-  module.def("ray_equations", &equations, nb::arg("row"), nb::arg("frame"), nb::arg("uv"), nb::arg("world_T_cam"),
-             nb::arg("intrinsics"), nb::kw_only(), nb::arg("tracks"),
-             "Normal equations (M, 3, 3) and (M, 3) of the points nearest to all rays of their tracks: ray n is of track "
-             "row (N,) and goes through the pixel uv (N, 2) of camera frame (N,) of world_T_cam (T, 4, 4).");
-  module.def("refine_points", &refined, nb::arg("row"), nb::arg("frame"), nb::arg("uv"), nb::arg("world_T_cam"),
-             nb::arg("intrinsics"), nb::arg("origin"), nb::arg("position"), nb::kw_only(), nb::arg("huber_px"),
-             nb::arg("steps"), nb::arg("converged"), nb::arg("ridge"), nb::arg("threads") = 0,
-             "Refine points (M, 3), NaN where there is none, on the reprojection errors of their rays; origin (T, 3) is "
-             "the world's in the cameras. Returns the points, NaN where a camera is in front of them, J'WJ (M, 3, 3), "
-             "the angles (M,) under which they see their cameras, and their lower median errors (M,) px.");
+  module.def(
+      "ray_equations", &equations, nb::arg("row"), nb::arg("frame"), nb::arg("uv"), nb::arg("world_T_cam"),
+      nb::arg("intrinsics"), nb::kw_only(), nb::arg("tracks"),
+      "Normal equations (M, 3, 3) and (M, 3) of the points nearest to all rays of their tracks: ray n is of track "
+      "row (N,) and goes through the pixel uv (N, 2) of camera frame (N,) of world_T_cam (T, 4, 4).");
+  module.def(
+      "refine_points", &refined, nb::arg("row"), nb::arg("frame"), nb::arg("uv"), nb::arg("world_T_cam"),
+      nb::arg("intrinsics"), nb::arg("origin"), nb::arg("position"), nb::kw_only(), nb::arg("huber_px"),
+      nb::arg("steps"), nb::arg("converged"), nb::arg("ridge"), nb::arg("threads") = 0,
+      "Refine points (M, 3), NaN where there is none, on the reprojection errors of their rays; origin (T, 3) is "
+      "the world's in the cameras. Returns the points, NaN behind a camera, J'WJ (M, 3, 3), "
+      "the angles (M,) under which they see their cameras, and their lower median errors (M,) px.");
   module.def("ray_angles", &angles, nb::arg("row"), nb::arg("frame"), nb::arg("uv"), nb::arg("world_T_cam"),
              nb::arg("intrinsics"), nb::arg("position"),
              "Angles (M,) under which points (M, 3) see the cameras of their rays, rad; NaN without either.");

@@ -21,9 +21,7 @@ double larger(double a, double b) { return std::isnan(a) || a > b ? a : b; }
 
 const double* pose_of(const PosedCameras& cameras, std::int64_t frame) { return cameras.world_T_cam + 16 * frame; }
 
-double inverse_of(double z) {
-  return z >= kNearPlane ? 1.0 / z : (2.0 * kNearPlane - z) / (kNearPlane * kNearPlane);
-}
+double inverse_of(double z) { return z >= kNearPlane ? 1.0 / z : (2.0 * kNearPlane - z) / (kNearPlane * kNearPlane); }
 
 /// Point in the axes of its camera, from the camera's center.
 void seen_from(const double* pose, const double* point, double* out) {
@@ -199,7 +197,8 @@ void refine_points(const TrackRays& rays, const PosedCameras& cameras, int track
 
 void ray_angles(const TrackRays& rays, const PosedCameras& cameras, const double* position, int tracks, double* angle) {
   const RaysByTrack by_track(rays.row, rays.size, tracks);
-  for (int m = 0; m < tracks; ++m) angle[m] = angle_of(rays, by_track, cameras, m, position + 3 * static_cast<std::size_t>(m));
+  for (int m = 0; m < tracks; ++m)
+    angle[m] = angle_of(rays, by_track, cameras, m, position + 3 * static_cast<std::size_t>(m));
 }
 
 void reprojection_errors(const TrackRays& rays, const PosedCameras& cameras, const double* position, double* error) {

@@ -227,8 +227,8 @@ def expected_shares(
 
 def _motion(add: Callable[[str, float, float], None]) -> None:
     """Add the tasks of depth from camera motion."""
-    add("starting views", 1.0, 0.045)
-    add("structure from motion", 0.3, 0.05)
-    add("focal lengths", 0.7, 0.045)
+    add("starting views", 0.62, 0.028)
+    add("structure from motion", 0.19, 0.031)
+    add("focal lengths", 0.43, 0.028)
     add("depth of moving things", 0.22, 0.045)
     add("depth maps", 0.12, 0.045)
