@@ -35,6 +35,9 @@ class TrackingConfig(Section):
         "'auto': with the C++ extension, as NumPy takes ten times as long; 'off': steps alone, each checked forwards "
         "and backwards.",
     )
+    refine_every: int = setting(
+        1, "Steps from one search for a first view to the next; the steps between are checked backwards.", ge=1
+    )
     patch_px: int = setting(15, "Side of the first view that is found again, px; made odd.", ge=5, le=61)
     min_patch_correlation: float = setting(
         0.8, "Correlation with its first view below which a point takes a new one where it is.", gt=0, lt=1

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
-from uni4d_fg.arrays import FloatArray, ImageArray
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
@@ -92,7 +94,7 @@ def test_templates_are_cut_between_pixels_and_empty_outside() -> None:
     assert np.isfinite(template[1][:, 1:]).all()
 
 
-def test_errors_do_not_add_up() -> None:
+def test_errors_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """A slow turn, zoom and shift over 40 frames with noise: steps drift, points that are found again do not."""
     frames, images = 41, []
     noise = np.random.default_rng(3)
@@ -106,21 +108,36 @@ def test_errors_do_not_add_up() -> None:
         stretch, shift = motion(t)
         exact = textured(np.linalg.inv(stretch), shift).astype(float)
         images.append(np.clip(exact + noise.normal(0, 3, exact.shape), 0, 255).astype(np.uint8))
-    drift: dict[str, float] = {}
-    for refine in ("on", "off"):
+    looked_for: list[int] = []
+
+    def counted(templates: Float32Array, rows: IntArray, *rest: Any) -> tuple[FloatArray, FloatArray]:
+        looked_for.append(len(rows))
+        return register(templates, rows, *rest)
+
+    monkeypatch.setattr("uni4d_fg.frontend.tracks.first_views.register", counted)
+    drift: dict[int, float] = {}
+    number: dict[int, int] = {}
+    for every in (1, 4, 0):
+        looked_for.clear()
         config = TrackingConfig(
             grid_columns=12,
             grid_rows=9,
             query_interval=100,
             margin_px=30,
             reseed_spacing=None,
-            refine="on" if refine == "on" else "off",
+            refine="on" if every else "off",
+            refine_every=max(every, 1),
         )
         tracks = track_grid(ArrayFrames(np.stack(images)), config)
         stretch, shift = motion(40)
         truth = (tracks.uv[:, 0] - CENTER - shift) @ stretch.T + CENTER
         seen = tracks.visible[:, 40]
         assert seen.mean() > 0.9
-        drift[refine] = float(np.median(np.linalg.norm(tracks.uv[:, 40] - truth, axis=1)[seen]))
-    assert drift["on"] < 0.08
-    assert drift["on"] < 0.5 * drift["off"]
+        drift[every] = float(np.median(np.linalg.norm(tracks.uv[:, 40] - truth, axis=1)[seen]))
+        number[every] = sum(looked_for)
+    assert drift[1] < 0.08
+    assert drift[1] < 0.5 * drift[0]
+    assert drift[4] < 0.1
+    assert drift[4] < 0.6 * drift[0]
+    assert number[0] == 0
+    assert 0.23 < number[4] / number[1] < 0.3

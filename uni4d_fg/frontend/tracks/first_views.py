@@ -38,7 +38,9 @@ class FirstViews:
     row: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """(N,) of each point among the templates."""
     affine: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
-    """(N, 4) by rows, from the first view to the present one."""
+    """(N, 4) by rows, from the first view to when it was last found."""
+    due: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(N,) steps until it is looked for again."""
     _used: int = 0
 
     def __post_init__(self) -> None:
@@ -58,11 +60,13 @@ class FirstViews:
         self.templates[self._used : end] = cut_templates(image, points, self.config.patch_px)
         self.row = np.concatenate((self.row, np.arange(self._used, end)))
         self.affine = np.concatenate((self.affine, np.tile(_IDENTITY, (len(points), 1))))
+        # Spread over the steps, so that no frame has all the corrections.
+        self.due = np.concatenate((self.due, np.arange(len(points)) % self.config.refine_every))
         self._used = end
 
     def select(self, keep: BoolArray | IntArray) -> None:
         """Forget all points but those picked by a mask or by indices."""
-        self.row, self.affine = self.row[keep], self.affine[keep]
+        self.row, self.affine, self.due = self.row[keep], self.affine[keep], self.due[keep]
 
     def follow(
         self, source: ImageArray, target: ImageArray, points: Float32Array, velocity: Float32Array
@@ -82,19 +86,26 @@ class FirstViews:
         refined = np.empty_like(points)
 
         def accept(rows: IntArray, moved: Float32Array, expected: Float32Array) -> BoolArray:
+            found = np.zeros(len(rows), np.bool_)
+            looked = np.flatnonzero(self.due[rows] <= 0)
+            chosen = rows[looked]
             warp, correlation = register(
-                self.templates, self.row[rows], target, np.concatenate((moved, self.affine[rows]), axis=1)
+                self.templates, self.row[chosen], target, np.concatenate((moved[looked], self.affine[chosen]), axis=1)
             )
-            found = _is_found(warp, correlation, moved, target, self.config)
-            refined[rows[found]], self.affine[rows[found]] = warp[found, :2], warp[found, 2:]
-            lost = np.flatnonzero(~found)
-            back = lost[comes_back(source, target, points[rows[lost]], moved[lost], expected[lost], self.config)]
-            refined[rows[back]], self.affine[rows[back]] = moved[back], _IDENTITY
-            self.templates[self.row[rows[back]]] = cut_templates(target, moved[back], self.config.patch_px)
+            found[looked] = seen = _is_found(warp, correlation, moved[looked], target, self.config)
+            refined[chosen[seen]], self.affine[chosen[seen]] = warp[seen, :2], warp[seen, 2:]
+            self.due[chosen] = self.config.refine_every
+            rest = np.flatnonzero(~found)
+            back = rest[comes_back(source, target, points[rows[rest]], moved[rest], expected[rest], self.config)]
+            refined[rows[back]] = moved[back]
+            anew = back[self.due[rows[back]] == self.config.refine_every]
+            self.affine[rows[anew]] = _IDENTITY
+            self.templates[self.row[rows[anew]]] = cut_templates(target, moved[anew], self.config.patch_px)
             found[back] = True
             return found
 
         kept, _ = search(source, target, points, velocity, accept, self.config)
+        self.due -= 1
         self.select(kept)
         return kept, refined[kept]
 
