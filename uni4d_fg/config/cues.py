@@ -30,13 +30,15 @@ class TrackingConfig(Section):
     convergence_px: float = setting(0.01, "Lucas-Kanade stops when a point moves less than this, px.", gt=0)
     forward_backward_px: float = setting(0.5, "Largest allowed forward-backward distance, px.", gt=0, basic=True)
     refine: Literal["auto", "on", "off"] = setting(
-        "off",
+        "auto",
         "Find each point's first view, affinely warped, in every image, so that errors of the steps do not add up. "
         "'auto': with the C++ extension, as NumPy takes ten times as long; 'off': steps alone, each checked forwards "
         "and backwards.",
     )
     refine_every: int = setting(
-        1, "Steps from one search for a first view to the next; the steps between are checked backwards.", ge=1
+        3,
+        "Steps from one search for a point's first view to the next; those between are checked forwards and backwards.",
+        ge=1,
     )
     patch_px: int = setting(15, "Side of the first view that is found again, px; made odd.", ge=5, le=61)
     min_patch_correlation: float = setting(
@@ -89,7 +91,7 @@ class LabelConfig(Section):
         0.05, "Depth is interpolated only between pixels that differ by less than this fraction.", ge=0
     )
     depth_edge_px: int = setting(
-        0,
+        7,
         "A static track has no depth this near (in x or y) to a surface in front of it, px: its window sees both, and "
         "moves with the front one. 0: it has; 7 is half a patch.",
         ge=0, le=100,

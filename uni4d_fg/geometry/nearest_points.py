@@ -1,6 +1,7 @@
-"""The nearest of many points in space, by OpenCV: for programs that answer at once.
+"""The nearest of many points, by OpenCV.
 
-scipy's tree finds the same, but to load it takes a third of a second, for which the viewer's first picture would wait.
+scipy's tree finds the same in twice the time; and to load it takes a third of a second, for which the viewer's first
+picture would wait.
 """
 
 from __future__ import annotations
@@ -15,21 +16,28 @@ _KD_TREE = {"algorithm": 4, "leaf_max_size": 10}
 _TO_THE_END = {"checks": -1}
 
 
-def nearest_points(
-    points: FloatArray | Float32Array, places: FloatArray | Float32Array, count: int
-) -> tuple[Float32Array, Int32Array]:
-    """Return the distances and rows of the nearest points, nearest first, each (M, count); in single precision.
+class NearestPoints:
+    """Points among which the nearest are found, exactly and in single precision.
 
     Args:
-        points: (N, 3) in any unit, finite; N at least ``count``.
-        places: (M, 3) in the same unit, finite; M at least 1.
-        count: Points that are asked for.
-
-    Raises:
-        ValueError: If there are fewer points.
+        points: (N, D) in any unit, finite; D is 2 or 3.
     """
-    if len(points) < count:
-        raise ValueError(f"{count} of {len(points)} points are asked for")
-    tree = cv2.flann.Index(np.ascontiguousarray(points, np.float32), _KD_TREE)
-    rows, squared = tree.knnSearch(np.ascontiguousarray(places, np.float32), count, params=_TO_THE_END)
-    return np.sqrt(squared), rows
+
+    def __init__(self, points: FloatArray | Float32Array) -> None:
+        self._count = len(points)
+        self._tree = cv2.flann.Index(np.ascontiguousarray(points, np.float32), _KD_TREE)
+
+    def find(self, places: FloatArray | Float32Array, count: int) -> tuple[Float32Array, Int32Array]:
+        """Return the distances and rows of the nearest points, nearest first, each (M, count).
+
+        Args:
+            places: (M, D) in the same unit, finite; M at least 1.
+            count: Points that are asked for, at most N.
+
+        Raises:
+            ValueError: If there are fewer points.
+        """
+        if self._count < count:
+            raise ValueError(f"{count} of {self._count} points are asked for")
+        rows, squared = self._tree.knnSearch(np.ascontiguousarray(places, np.float32), count, params=_TO_THE_END)
+        return np.sqrt(squared), rows

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
-from uni4d_fg.geometry.nearest_points import nearest_points
+from uni4d_fg.geometry.nearest_points import NearestPoints
 
 CHUNK_POINTS = 40_000
 _MOST_CHUNKS = 32
@@ -66,7 +66,7 @@ def spacing_of(points: FloatArray | Float32Array) -> float:
         return 0.01
     sample = points[:: max(1, len(points) // _SPACING_SAMPLES)]
     # The fourth neighbor, of four that a point on a grid has: the nearest one alone is that of points that coincide.
-    distance, _ = nearest_points(points, sample, 5)
+    distance, _ = NearestPoints(points).find(sample, 5)
     return max(float(np.median(distance[:, -1])), 1e-6)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.geometry.nearest_points import nearest_points
+from uni4d_fg.geometry.nearest_points import NearestPoints
 from uni4d_fg.results.clouds import read_ply
 from uni4d_fg.results.fusion import clouds
 from uni4d_fg.results.run import Run
@@ -123,6 +123,6 @@ def _nearest_instance(reconstruction: Reconstruction, points: FloatArray, frame:
     known = np.isfinite(here).all(axis=1)
     if not known.any() or not len(points):
         return np.ones(len(points), np.int32)
-    _, nearest = nearest_points(here[known], points, 1)
+    _, nearest = NearestPoints(here[known]).find(points, 1)
     instance: Int32Array = reconstruction.dynamic_instance[known][nearest[:, 0]]
     return instance

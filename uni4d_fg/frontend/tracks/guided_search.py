@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray, IntArray
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.frontend.tracks.optical_flow import comes_back, find
+from uni4d_fg.geometry.nearest_points import NearestPoints
 
 _GUIDE_EVERY = 12
 """One of so many points is a guide."""
@@ -112,13 +112,15 @@ def search(
 
 def _median_around(points: Float32Array, neighbors: Float32Array, values: Float32Array) -> Float32Array:
     """Return the medians (N, 2) of the values (M, 2) of those of some neighbors (M, 2) that are nearest to points."""
-    _, near = cKDTree(neighbors).query(points, k=_NEIGHBORS)
+    if not len(points):
+        return np.zeros_like(points)
+    _, near = NearestPoints(neighbors).find(points, _NEIGHBORS)
     return _median(values[near])
 
 
 def _median_of_others(points: Float32Array, values: Float32Array) -> Float32Array:
     """Return the medians (N, 2) of the values (N, 2) of those nearest to each point, itself left out."""
-    _, near = cKDTree(points).query(points, k=_NEIGHBORS + 1)
+    _, near = NearestPoints(points).find(points, _NEIGHBORS + 1)
     # Of points in one place any may be the nearest: oneself goes last, wherever it is.
     itself = near == np.arange(len(points))[:, None]
     near = np.take_along_axis(near, np.argsort(itself, axis=1, kind="stable"), axis=1)

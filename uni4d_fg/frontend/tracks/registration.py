@@ -37,17 +37,17 @@ def cut_templates(image: ImageArray, points: Float32Array, patch_px: int) -> Flo
     """
     reach = patch_px // 2 + 1
     height, width = image.shape
-    offset = np.arange(-reach, reach + 1, dtype=np.float32)
-    u, v = points[:, :1] + offset, points[:, 1:] + offset
-    left = np.clip(np.floor(u).astype(np.int64), 0, max(width - 2, 0))
-    top = np.clip(np.floor(v).astype(np.int64), 0, max(height - 2, 0))
-    fu, fv = (u - left.astype(np.float32))[:, None, :], (v - top.astype(np.float32))[:, :, None]
-    at = (top * width)[:, :, None] + left[:, None, :]
+    whole = np.floor(points)
+    # One place between four pixels for all of a patch, whose gray levels are gathered once.
+    fu, fv = (points - whole)[:, 0, None, None], (points - whole)[:, 1, None, None]
+    offset = np.arange(-reach, reach + 2)
+    column, row = whole[:, :1].astype(np.int64) + offset, whole[:, 1:].astype(np.int64) + offset
     flat = image.reshape(-1).astype(np.float32)
-    right, below = min(1, width - 1), width * min(1, height - 1)
-    above = flat[at] + fu * (flat[at + right] - flat[at])
-    under = flat[at + below] + fu * (flat[at + below + right] - flat[at + below])
-    templates: Float32Array = above + fv * (under - above)
+    at = (np.clip(row, 0, height - 1) * width)[:, :, None] + np.clip(column, 0, width - 1)[:, None, :]
+    levels = flat[at]
+    across = levels[:, :, :-1] + fu * (levels[:, :, 1:] - levels[:, :, :-1])
+    templates: Float32Array = across[:, :-1] + fv * (across[:, 1:] - across[:, :-1])
+    u, v = points[:, :1] + offset[:-1], points[:, 1:] + offset[:-1]
     outside = ((v < 0) | (v > height - 1))[:, :, None] | ((u < 0) | (u > width - 1))[:, None, :]
     templates[outside] = np.nan
     return templates
@@ -59,14 +59,18 @@ def is_fast() -> bool:
 
 
 def register(
-    templates: Float32Array, rows: IntArray, image: ImageArray, warp: FloatArray, use_extension: bool = True
+    templates: Float32Array,
+    rows: IntArray,
+    image: ImageArray | FloatArray,
+    warp: FloatArray,
+    use_extension: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
     """Find templates in an image.
 
     Args:
         templates: (M, P + 2, P + 2) of :func:`cut_templates`.
         rows: (N,) which of them.
-        image: (H, W) uint8.
+        image: (H, W) gray levels.
         warp: (N, 6) where to start: u, v in px and the affine part by rows.
         use_extension: Use the C++ extension if it is installed; the result is the same up to rounding.
 
@@ -75,7 +79,7 @@ def register(
         of the image, or is not near.
     """
     weight = _weights(templates.shape[1] - 2)
-    gray = image.astype(np.float64)
+    gray = np.asarray(image, np.float64)
     if use_extension and is_fast():
         core = import_extension()
         found: FloatArray

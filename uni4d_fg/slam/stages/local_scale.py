@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
+from uni4d_fg.geometry.nearest_points import NearestPoints
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
@@ -70,12 +70,11 @@ def predict_log_scale(
         mine = np.flatnonzero(queries.frame == frame)
         if len(known) <= neighbors:
             return mine[:0], np.zeros(0), np.zeros(0)
-        # Points spread over an image need no balanced tree, which takes longer to build.
-        tree, values = cKDTree(static.uv[known], balanced_tree=False), deviation[known]
+        tree, values = NearestPoints(static.uv[known]), deviation[known]
         sample = evenly_spread(len(known), samples)
         predicted, away = np.zeros(len(mine)), 0.0
         if len(mine):
-            distance, near = (found.reshape(len(mine), -1) for found in tree.query(queries.uv[mine], neighbors))
+            distance, near = tree.find(queries.uv[mine], neighbors)
             predicted = np.median(values[near], axis=1)
             away = float(np.median(distance[:, 0]))
         uv, errors = static.uv[known], [np.zeros(0)]
@@ -84,7 +83,7 @@ def predict_log_scale(
             inside = np.flatnonzero(((at >= uv.min(axis=0)) & (at <= uv.max(axis=0))).all(axis=1))
             if not len(inside):
                 continue
-            _, near = tree.query(at[inside], k=neighbors + 1)
+            _, near = tree.find(at[inside], neighbors + 1)
             # Without the point itself, or else without the one that is farthest.
             own = near == sample[inside, None]
             own[~own.any(axis=1), -1] = True
