@@ -241,8 +241,8 @@ def test_a_static_track_has_no_depth_beside_a_surface_in_front() -> None:
     def found(config: LabelConfig, mask: np.ndarray) -> list[float]:
         return label_tracks(tracks, sequence(frames, mask, depth), config, InputConfig()).depth[:, 0].tolist()
 
-    seven = CONFIG.model_copy(update={"depth_edge_px": 7})
+    none, seven = (CONFIG.model_copy(update={"depth_edge_px": reach}) for reach in (0, 7))
     np.testing.assert_allclose(found(seven, mask), [2.0, 2.0, np.nan, np.nan, 1.6], rtol=1e-6)
-    np.testing.assert_allclose(found(CONFIG, mask), [2.0, 2.0, 2.0, 2.0, 1.6], rtol=1e-6)
+    np.testing.assert_allclose(found(none, mask), [2.0, 2.0, 2.0, 2.0, 1.6], rtol=1e-6)
     # What moves keeps its depth: its own silhouette is where it is seen.
     np.testing.assert_allclose(found(seven, mask + 1), [2.0, 2.0, 2.0, 2.0, 1.6], rtol=1e-6)
