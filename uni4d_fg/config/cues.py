@@ -91,7 +91,7 @@ class LabelConfig(Section):
         0.05, "Depth is interpolated only between pixels that differ by less than this fraction.", ge=0
     )
     depth_edge_px: int = setting(
-        7,
+        0,
         "A static track has no depth this near (in x or y) to a surface in front of it, px: its window sees both, and "
         "moves with the front one. 0: it has; 7 is half a patch.",
         ge=0, le=100,

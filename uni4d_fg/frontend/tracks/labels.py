@@ -107,7 +107,7 @@ def _look(
     column, row = _nearest_pixel(uv, (mask.shape[0], mask.shape[1]))
     depth = sample_depth(depth_map, uv, input_config.min_depth_m, input_config.max_depth_m, config.max_depth_spread)
     front = nearest_around(depth_map, uv, input_config.min_depth_m, config.depth_edge_px)
-    return certain[row, column], depth, np.asarray(depth > front / (1.0 - config.depth_edge_step))
+    return certain[row, column], depth, np.asarray(front < depth * (1.0 - config.depth_edge_step))
 
 
 def static_frames_needed(num_frames: int, config: LabelConfig) -> int:
