@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from uni4d_fg.geometry.nearest_points import NearestPoints
 
 
-@given(st.integers(5, 300), st.integers(1, 40), st.integers(1, 5), st.integers(2, 3), st.integers(0, 10_000))
+@given(st.integers(5, 300), st.integers(0, 40), st.integers(1, 5), st.integers(2, 3), st.integers(0, 10_000))
 def test_they_are_those_of_every_distance(points: int, places: int, count: int, dimensions: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     cloud, asked = rng.normal(size=(points, dimensions)), rng.normal(size=(places, dimensions))

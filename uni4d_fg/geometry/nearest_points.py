@@ -31,7 +31,7 @@ class NearestPoints:
         """Return the distances and rows of the nearest points, nearest first, each (M, count).
 
         Args:
-            places: (M, D) in the same unit, finite; M at least 1.
+            places: (M, D) in the same unit, finite.
             count: Points that are asked for, at most N.
 
         Raises:
@@ -39,5 +39,7 @@ class NearestPoints:
         """
         if self._count < count:
             raise ValueError(f"{count} of {self._count} points are asked for")
+        if not len(places):  # which OpenCV refuses
+            return np.zeros((0, count), np.float32), np.zeros((0, count), np.int32)
         rows, squared = self._tree.knnSearch(np.ascontiguousarray(places, np.float32), count, params=_TO_THE_END)
         return np.sqrt(squared), rows

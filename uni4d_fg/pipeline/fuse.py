@@ -126,8 +126,8 @@ def _on_workers(
 ) -> None:  # fmt: skip
     try:
         for part in fuse_in_parts(maps, writer, workers, reporter.advance):
-            for number, of_frame in enumerate(part.told):
-                _note(sure, told, part.confidence[number] if part.confidence else None, of_frame)
+            for confidence, of_frame in zip(part.confidence, part.told, strict=True):
+                _note(sure, told, confidence, of_frame)
     except Cancelled as error:
         raise Cancelled(_STOPPED) from error
 

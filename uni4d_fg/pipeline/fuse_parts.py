@@ -47,8 +47,8 @@ class FusedPart:
 
     written: dict[int, int]
     """Frame to the checksum of its map."""
-    confidence: list[ImageArray]
-    """Of each frame, (h, w) in steps; none unless static depth is made as a field."""
+    confidence: list[ImageArray | None]
+    """Of each frame, (h, w) in steps; None unless static depth is made as a field."""
     told: list[ToldError]
     """Of each frame."""
     matched: set[int]
@@ -62,11 +62,11 @@ def fuse_part(item: FusionPart, run: StageRunner, hooks: Hooks) -> FusedPart:
         InputError: If a frame cannot be read.
         OutputError: If depth cannot be written.
     """
-    confidence, told = list[ImageArray](), list[ToldError]()
+    confidence, told = list[ImageArray | None](), list[ToldError]()
     with item.place.opened() as writer:
         for fused in fused_frames(item.maps, item.first, item.stop):
             writer.write(fused.frame, fused.depth)
-            confidence += [] if fused.confidence is None else [fused.confidence]
+            confidence.append(fused.confidence)
             told.append(fused.told)
     return FusedPart(writer.written, confidence, told, item.maps.matched)
 

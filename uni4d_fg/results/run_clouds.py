@@ -121,7 +121,7 @@ def _nearest_instance(reconstruction: Reconstruction, points: FloatArray, frame:
     """Return the instance of the nearest trajectory for each point (N, 3); 1 where there is none."""
     here = reconstruction.dynamic_points[:, frame]
     known = np.isfinite(here).all(axis=1)
-    if not known.any() or not len(points):
+    if not known.any():
         return np.ones(len(points), np.int32)
     _, nearest = NearestPoints(here[known]).find(points, 1)
     instance: Int32Array = reconstruction.dynamic_instance[known][nearest[:, 0]]

@@ -1,8 +1,8 @@
-"""Following points by their first views: a step of Lucas-Kanade, then registration against the view they started in.
+"""Following points by their first views: steps of Lucas-Kanade, and registration against the view they started in.
 
-A chain of steps adds up the errors of each. Here a step only says where to look: the point is where its first view is
-found (:mod:`uni4d_fg.frontend.tracks.registration`), and a view that is found needs no check backwards. A point whose
-first view is not found (another scale, a highlight, a neighbor in front) is checked backwards and takes a new first
+A chain of steps adds up the errors of each. Here every few steps a point is put where its first view is found
+(:mod:`uni4d_fg.frontend.tracks.registration`); a view that is found needs no check backwards. A point whose first view
+is looked for and not found (another scale, a highlight, a neighbor in front) is checked backwards and takes a new first
 view where the step led it.
 """
 
@@ -71,7 +71,7 @@ class FirstViews:
     def follow(
         self, source: ImageArray, target: ImageArray, points: Float32Array, velocity: Float32Array
     ) -> tuple[BoolArray, Float32Array]:
-        """Move the N points from one gray image to the next, to where their first views are found.
+        """Move the N points from one gray image to the next, those that are due to where their first views are found.
 
         Args:
             source: (H, W) uint8, the image in which the points are known.
@@ -87,7 +87,8 @@ class FirstViews:
 
         def accept(rows: IntArray, moved: Float32Array, expected: Float32Array) -> BoolArray:
             found = np.zeros(len(rows), np.bool_)
-            looked = np.flatnonzero(self.due[rows] <= 0)
+            due = self.due[rows] <= 0
+            looked = np.flatnonzero(due)
             chosen = rows[looked]
             warp, correlation = register(
                 self.templates, self.row[chosen], gray, np.concatenate((moved[looked], self.affine[chosen]), axis=1)
@@ -98,7 +99,7 @@ class FirstViews:
             rest = np.flatnonzero(~found)
             back = rest[comes_back(source, target, points[rows[rest]], moved[rest], expected[rest], self.config)]
             refined[rows[back]] = moved[back]
-            anew = back[self.due[rows[back]] == self.config.refine_every]
+            anew = back[due[back]]
             self.affine[rows[anew]] = _IDENTITY
             self.templates[self.row[rows[anew]]] = cut_templates(target, moved[anew], self.config.patch_px)
             found[back] = True

@@ -112,8 +112,6 @@ def search(
 
 def _median_around(points: Float32Array, neighbors: Float32Array, values: Float32Array) -> Float32Array:
     """Return the medians (N, 2) of the values (M, 2) of those of some neighbors (M, 2) that are nearest to points."""
-    if not len(points):
-        return np.zeros_like(points)
     _, near = NearestPoints(neighbors).find(points, _NEIGHBORS)
     return _median(values[near])
 
