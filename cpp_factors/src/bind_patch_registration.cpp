@@ -22,7 +22,7 @@ std::pair<FloatArray, FloatArray> register_all(const AnyArray& templates, const 
   for (std::int64_t i = 0; i < w.size(); ++i)
     if (!(w.data[i] >= 0.0)) refuse("weight: a value is negative");
   const View<float> patches = expect_singles(templates, "templates", {kAnyLength, side + 2, side + 2});
-  const View<double> gray = expect_floats(image, "image", {kAnyLength, kAnyLength});
+  const View<std::uint8_t> gray = expect_bytes(image, "image", {kAnyLength, kAnyLength});
   const View<double> start = expect_floats(warp, "warp", {kAnyLength, 6});
   const View<std::int64_t> which = expect_rows(rows, "rows", start.rows(), patches.rows());
   if (!(stiffness >= 0.0) || !std::isfinite(stiffness)) refuse("stiffness: expected a finite number, 0 or more");
@@ -47,7 +47,7 @@ void bind_patch_registration(nb::module_& module) {
   module.def("register_patches", &register_all, nb::arg("templates"), nb::arg("rows"), nb::arg("image"),
              nb::arg("warp"), nb::kw_only(), nb::arg("weight"), nb::arg("stiffness"), nb::arg("max_iterations"),
              nb::arg("convergence_px"), nb::arg("threads") = 0,
-             "Find the rows (N,) of templates (M, P + 2, P + 2) in an image (H, W) under affine warps, from warp (N, 6): "
+             "Find the rows (N,) of templates (M, P + 2, P + 2) in an image (H, W) of bytes under affine warps, from warp (N, 6): "
              "u, v and the affine part by rows. Returns the warps and the correlations (N,), -1 where there is none.");
 }
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <vector>
 
 #include "uni4d_fg/parallel.hpp"
@@ -13,24 +14,32 @@ namespace {
 
 constexpr int kGrain = 64;
 constexpr int kParameters = 6;
-constexpr double kLeastVariance = 1.0;    // gray levels squared: what has less contrast is not registered
-constexpr double kLeastInside = 0.5;      // part of the weight that must lie inside the image
-constexpr double kLargestStepPx = 5.0;    // a longer one is no refinement
-constexpr double kLeastDeterminant = 0.1; // of an affine step
+constexpr double kLeastVariance = 1.0;     // gray levels squared: what has less contrast is not registered
+constexpr double kLeastInside = 0.5;       // part of the weight that must lie inside the image
+constexpr double kLargestStepPx = 5.0;     // a longer one is no refinement
+constexpr double kLeastDeterminant = 0.1;  // of an affine step
 
-/// Pixels of one patch, padded to whole SIMD values by pixels of weight zero.
+/// Pixels of one patch, padded to whole SIMD values by pixels of weight zero. Floats will do: gray levels are relative
+/// to the mean of the template, and places in the image to the pixel around which they lie.
 struct Workspace {
   int blocks;
-  std::vector<double> x, y, weight, value, gradient_x, gradient_y, sampled, used;
+  float mean = 0.0F;  ///< Of the template, gray levels.
+  std::vector<float> x, y, weight, value, gradient_x, gradient_y, sampled, used, fu, fv;
+  std::vector<int> at;                      ///< Upper left of the four pixels around a place; 0 outside of the image.
+  std::vector<std::uint16_t> upper, lower;  ///< The two pixels of each row, the left one in the low byte.
 
   explicit Workspace(const PatchSettings& settings) {
     const int side = 2 * settings.half + 1;
-    blocks = (side * side + kSimd8Width - 1) / kSimd8Width;
-    const auto size = static_cast<std::size_t>(blocks * kSimd8Width);
-    for (auto* array : {&x, &y, &weight, &value, &gradient_x, &gradient_y, &sampled, &used}) array->assign(size, 0.0);
+    blocks = (side * side + kSimdFloatWidth - 1) / kSimdFloatWidth;
+    const auto size = static_cast<std::size_t>(blocks * kSimdFloatWidth);
+    for (auto* array : {&x, &y, &weight, &value, &gradient_x, &gradient_y, &sampled, &used, &fu, &fv})
+      array->assign(size, 0.0F);
+    at.assign(size, 0);
+    upper.assign(size, 0);
+    lower.assign(size, 0);
     for (int i = 0; i < side * side; ++i) {
-      x[static_cast<std::size_t>(i)] = i % side - settings.half;
-      y[static_cast<std::size_t>(i)] = i / side - settings.half;
+      x[static_cast<std::size_t>(i)] = static_cast<float>(i % side - settings.half);
+      y[static_cast<std::size_t>(i)] = static_cast<float>(i / side - settings.half);
     }
   }
 };
@@ -66,77 +75,126 @@ void solve(const double* l, double* b) {
   }
 }
 
-/// Values, gradients and weights of a template; pixels without all of them weigh nothing.
-void load_template(const float* patch, const PatchSettings& settings, Workspace& work) {
+/// Values, gradients and weights of a template; pixels without all of them weigh nothing. Returns the sum of the
+/// weights.
+double load_template(const float* patch, const PatchSettings& settings, Workspace& work) {
   const int side = 2 * settings.half + 1, stride = side + 2;
+  double total = 0.0, sum = 0.0;
   for (int row = 0, i = 0; row < side; ++row)
     for (int column = 0; column < side; ++column, ++i) {
       const float* at = patch + (row + 1) * stride + column + 1;
-      const double by_x = 0.5 * (static_cast<double>(at[1]) - at[-1]);
-      const double by_y = 0.5 * (static_cast<double>(at[stride]) - at[-stride]);
+      const float by_x = 0.5F * (at[1] - at[-1]), by_y = 0.5F * (at[stride] - at[-stride]);
       const bool whole = std::isfinite(by_x + by_y + at[0]);
       const auto n = static_cast<std::size_t>(i);
-      work.value[n] = whole ? at[0] : 0.0;
-      work.gradient_x[n] = whole ? by_x : 0.0;
-      work.gradient_y[n] = whole ? by_y : 0.0;
-      work.weight[n] = whole ? settings.weight[i] : 0.0;
+      work.value[n] = whole ? at[0] : 0.0F;
+      work.gradient_x[n] = whole ? by_x : 0.0F;
+      work.gradient_y[n] = whole ? by_y : 0.0F;
+      work.weight[n] = whole ? static_cast<float>(settings.weight[i]) : 0.0F;
+      total += work.weight[n];
+      sum += work.weight[n] * work.value[n];
     }
+  work.mean = total > 0.0 ? static_cast<float>(sum / total) : 0.0F;
+  for (float& value : work.value) value -= work.mean;
+  return total;
 }
 
-/// Hessian of the weighted squared differences; returns the sum of the weights.
-UNI4D_FG_WIDE_CLONES double hessian(const Workspace& work, double* out) {
-  Simd8 sums[21], total{};
-  for (Simd8& s : sums) s = Simd8{};
+/// Hessian of the weighted squared differences.
+UNI4D_FG_WIDE_CLONES void hessian(const Workspace& work, double* out) {
+  SimdFloat sums[21];
+  for (SimdFloat& s : sums) s = SimdFloat{};
   for (int b = 0; b < work.blocks; ++b) {
-    const auto at = static_cast<std::size_t>(b * kSimd8Width);
-    const Simd8 x = load_simd8(&work.x[at]), y = load_simd8(&work.y[at]), w = load_simd8(&work.weight[at]);
-    const Simd8 gx = load_simd8(&work.gradient_x[at]), gy = load_simd8(&work.gradient_y[at]);
-    const Simd8 row[kParameters] = {gx, gy, gx * x, gx * y, gy * x, gy * y};
+    const auto at = static_cast<std::size_t>(b * kSimdFloatWidth);
+    const SimdFloat x = load_floats(&work.x[at]), y = load_floats(&work.y[at]), w = load_floats(&work.weight[at]);
+    const SimdFloat gx = load_floats(&work.gradient_x[at]), gy = load_floats(&work.gradient_y[at]);
+    const SimdFloat row[kParameters] = {gx, gy, gx * x, gx * y, gy * x, gy * y};
     for (int i = 0, n = 0; i < kParameters; ++i) {
-      const Simd8 weighted = w * row[i];
+      const SimdFloat weighted = w * row[i];
       for (int j = 0; j <= i; ++j, ++n) sums[n] += weighted * row[j];
     }
-    total += w;
   }
   for (int i = 0, n = 0; i < kParameters; ++i)
     for (int j = 0; j <= i; ++j, ++n) out[i * kParameters + j] = sum(sums[n]);
-  return sum(total);
+}
+
+/// An affine warp as the pixel around which it lies, and what is added to that.
+struct Place {
+  int left, top;
+  float u, v, a, b, c, d;
+};
+
+/// Find the four pixels around where each pixel of the patch lies: the upper left of them, and how far it is from
+/// there. Those that are not all in the image weigh nothing, and are taken from its beginning.
+UNI4D_FG_WIDE_CLONES void locate(const Place& place, int width, int height, int size, const float* __restrict x,
+                                 const float* __restrict y, const float* __restrict weight, int* __restrict at,
+                                 float* __restrict fu, float* __restrict fv, float* __restrict used) {
+  const int first_column = -place.left, last_column = width - 1 - place.left, first_row = -place.top;
+  const int last_row = height - 1 - place.top, origin = place.top * width + place.left;
+  for (int i = 0; i < size; ++i) {
+    const float u = place.u + place.a * x[i] + place.b * y[i], v = place.v + place.c * x[i] + place.d * y[i];
+    const float whole_u = std::floor(u), whole_v = std::floor(v);
+    const int column = static_cast<int>(whole_u), row = static_cast<int>(whole_v);
+    // A number and no truth value, so that nothing branches.
+    const int inside = static_cast<int>(column >= first_column) & static_cast<int>(row >= first_row) &
+                       static_cast<int>(column < last_column) & static_cast<int>(row < last_row);
+    fu[i] = u - whole_u;
+    fv[i] = v - whole_v;
+    at[i] = inside * (row * width + column + origin);
+    used[i] = weight[i] * static_cast<float>(inside);
+  }
+}
+
+/// Take pairs of neighboring pixels.
+void gather(const std::uint8_t* from, int size, const int* __restrict at, std::uint16_t* __restrict pairs) {
+  for (int i = 0; i < size; ++i) std::memcpy(pairs + i, from + at[i], sizeof(std::uint16_t));
+}
+
+/// Bilinear gray levels, less the mean of the template, from the two pixels above and the two below.
+UNI4D_FG_WIDE_CLONES void interpolate(int size, float mean, const std::uint16_t* __restrict upper,
+                                      const std::uint16_t* __restrict lower, const float* __restrict fu,
+                                      const float* __restrict fv, float* __restrict sampled) {
+  for (int i = 0; i < size; ++i) {
+    const auto p = static_cast<float>(upper[i] & 255), q = static_cast<float>(upper[i] >> 8);
+    const auto r = static_cast<float>(lower[i] & 255), s = static_cast<float>(lower[i] >> 8);
+    const float above = p + fu[i] * (q - p), below = r + fu[i] * (s - r);
+    sampled[i] = above + fv[i] * (below - above) - mean;
+  }
 }
 
 /// Sample the image under a warp; pixels that fall outside weigh nothing in `used`.
-UNI4D_FG_WIDE_CLONES Moments sample(const GrayImage& image, const double* warp, Workspace& work) {
-  const double right = image.width - 1, bottom = image.height - 1;
-  Simd8 sums[6];
-  for (Simd8& s : sums) s = Simd8{};
+void sample(const GrayImage& image, const double* warp, Workspace& work) {
+  const double left = std::floor(warp[0]), top = std::floor(warp[1]);
+  const Place place{static_cast<int>(left),
+                    static_cast<int>(top),
+                    static_cast<float>(warp[0] - left),
+                    static_cast<float>(warp[1] - top),
+                    static_cast<float>(warp[2]),
+                    static_cast<float>(warp[3]),
+                    static_cast<float>(warp[4]),
+                    static_cast<float>(warp[5])};
+  const int size = work.blocks * kSimdFloatWidth;
+  locate(place, image.width, image.height, size, work.x.data(), work.y.data(), work.weight.data(), work.at.data(),
+         work.fu.data(), work.fv.data(), work.used.data());
+  gather(image.data, size, work.at.data(), work.upper.data());
+  gather(image.data + image.width, size, work.at.data(), work.lower.data());
+  interpolate(size, work.mean, work.upper.data(), work.lower.data(), work.fu.data(), work.fv.data(),
+              work.sampled.data());
+}
+
+/// Weighted means, variances and covariance of what was sampled and of the template, where both are known.
+UNI4D_FG_WIDE_CLONES Moments compare(const Workspace& work) {
+  SimdFloat sums[6];
+  for (SimdFloat& s : sums) s = SimdFloat{};
   for (int b = 0; b < work.blocks; ++b) {
-    const auto at = static_cast<std::size_t>(b * kSimd8Width);
-    const Simd8 x = load_simd8(&work.x[at]), y = load_simd8(&work.y[at]);
-    const Simd8 u = warp[0] + warp[2] * x + warp[3] * y, v = warp[1] + warp[4] * x + warp[5] * y;
-    Simd8 w = load_simd8(&work.weight[at]), fu{}, fv{}, p[4] = {};
-    for (int l = 0; l < kSimd8Width; ++l) {
-      if (!(u[l] >= 0.0 && v[l] >= 0.0 && u[l] < right && v[l] < bottom)) {
-        w[l] = 0.0;
-        continue;
-      }
-      const int column = static_cast<int>(u[l]), row = static_cast<int>(v[l]);
-      const double* from = image.data + static_cast<long>(row) * image.width + column;
-      fu[l] = u[l] - column;
-      fv[l] = v[l] - row;
-      p[0][l] = from[0];
-      p[1][l] = from[1];
-      p[2][l] = from[image.width];
-      p[3][l] = from[image.width + 1];
-    }
-    const Simd8 above = p[0] + fu * (p[1] - p[0]), below = p[2] + fu * (p[3] - p[2]);
-    const Simd8 value = above + fv * (below - above), first = load_simd8(&work.value[at]);
-    store_simd8(value, &work.sampled[at]);
-    store_simd8(w, &work.used[at]);
+    const auto i = static_cast<std::size_t>(b * kSimdFloatWidth);
+    const SimdFloat w = load_floats(&work.used[i]), value = load_floats(&work.sampled[i]);
+    const SimdFloat first = load_floats(&work.value[i]);
+    const SimdFloat weighted = w * value, other = w * first;
     sums[0] += w;
-    sums[1] += w * value;
-    sums[2] += w * value * value;
-    sums[3] += w * first;
-    sums[4] += w * first * first;
-    sums[5] += w * first * value;
+    sums[1] += weighted;
+    sums[2] += weighted * value;
+    sums[3] += other;
+    sums[4] += other * first;
+    sums[5] += other * value;
   }
   Moments out;
   out.weight = sum(sums[0]);
@@ -150,16 +208,17 @@ UNI4D_FG_WIDE_CLONES Moments sample(const GrayImage& image, const double* warp, 
 }
 
 UNI4D_FG_WIDE_CLONES void gradient(const Workspace& work, const Moments& moments, double* out) {
-  const double gain = std::sqrt(moments.variance / moments.sampled_variance);
-  Simd8 sums[kParameters];
-  for (Simd8& s : sums) s = Simd8{};
+  const auto gain = static_cast<float>(std::sqrt(moments.variance / moments.sampled_variance));
+  const auto offset = static_cast<float>(moments.mean - gain * moments.sampled_mean);
+  SimdFloat sums[kParameters];
+  for (SimdFloat& s : sums) s = SimdFloat{};
   for (int b = 0; b < work.blocks; ++b) {
-    const auto at = static_cast<std::size_t>(b * kSimd8Width);
-    const Simd8 x = load_simd8(&work.x[at]), y = load_simd8(&work.y[at]);
-    const Simd8 difference = gain * (load_simd8(&work.sampled[at]) - broadcast(moments.sampled_mean)) -
-                             (load_simd8(&work.value[at]) - broadcast(moments.mean));
-    const Simd8 weighted = load_simd8(&work.used[at]) * difference;
-    const Simd8 by_x = weighted * load_simd8(&work.gradient_x[at]), by_y = weighted * load_simd8(&work.gradient_y[at]);
+    const auto at = static_cast<std::size_t>(b * kSimdFloatWidth);
+    const SimdFloat x = load_floats(&work.x[at]), y = load_floats(&work.y[at]);
+    const SimdFloat difference = gain * load_floats(&work.sampled[at]) - load_floats(&work.value[at]) + offset;
+    const SimdFloat weighted = load_floats(&work.used[at]) * difference;
+    const SimdFloat by_x = weighted * load_floats(&work.gradient_x[at]);
+    const SimdFloat by_y = weighted * load_floats(&work.gradient_y[at]);
     sums[0] += by_x;
     sums[1] += by_y;
     sums[2] += by_x * x;
@@ -187,19 +246,31 @@ double compose(const double* step, double* warp) {
   return std::sqrt(u * u + v * v);
 }
 
+/// Whether a warp is one whose pixels can be told in whole numbers; the patch is outside of the image if it is not.
+bool is_near(const double* warp, const GrayImage& image) {
+  if (image.width < 2 || image.height < 2) return false;
+  for (int i = 0; i < 2; ++i)
+    if (!(std::abs(warp[i]) < 1e6)) return false;
+  for (int i = 2; i < kParameters; ++i)
+    if (!(std::abs(warp[i]) < 1e3)) return false;
+  return true;
+}
+
 /// Register one template; returns its correlation, -1 if there is none.
 double register_one(const float* patch, const GrayImage& image, const PatchSettings& settings, Workspace& work,
                     double* warp) {
-  load_template(patch, settings, work);
+  const double total = load_template(patch, settings, work);
   double system[kParameters * kParameters], step[kParameters];
-  const double total = hessian(work, system);
+  hessian(work, system);
   const double stiffness = settings.stiffness * total * settings.half * settings.half;
   for (int i = 2; i < kParameters; ++i) system[i * kParameters + i] += stiffness;
   if (!factorize(system)) return -1.0;
   const double start[4] = {warp[2], warp[3], warp[4], warp[5]};
   double moved = INFINITY;
   for (int iteration = 0;; ++iteration) {
-    const Moments moments = sample(image, warp, work);
+    if (!is_near(warp, image)) return -1.0;
+    sample(image, warp, work);
+    const Moments moments = compare(work);
     if (!(moments.weight >= kLeastInside * total) || !(moments.sampled_variance > kLeastVariance) ||
         !(moments.variance > kLeastVariance))
       return -1.0;

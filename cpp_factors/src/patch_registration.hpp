@@ -16,7 +16,7 @@ struct PatchSettings {
 
 /// Gray image, row by row.
 struct GrayImage {
-  const double* data = nullptr;
+  const std::uint8_t* data = nullptr;
   int height = 0;
   int width = 0;
 };

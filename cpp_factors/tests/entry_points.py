@@ -57,7 +57,7 @@ ENTRY_POINTS["whiten"] = EntryPoint(
 def _patches(rng: np.random.Generator) -> dict[str, Any]:
     return {
         "rows": np.arange(5),
-        "image": rng.uniform(0, 255, (30, 40)),
+        "image": rng.integers(0, 255, (30, 40), dtype=np.uint8),
         "warp": np.concatenate([rng.uniform(10, 20, (5, 2)), np.tile([1.0, 0, 0, 1], (5, 1))], axis=1),
         "weight": np.ones((7, 7)),
         "stiffness": 2.0,

@@ -19,8 +19,8 @@ SHAPE_CHANGES = ("longer", "shorter", "extra axis", "no axes", "last axis", "emp
 def spoil(array: np.ndarray, data: st.DataObject, negative: bool) -> tuple[Any, str]:
     """Return a malformed version of an array and what is wrong with it."""
     kinds = ["dtype", "shape", "strides", "not an array"]
-    floating = array.dtype.kind == "f"
-    kinds += ["value"] if floating else ["range"]
+    # Any byte is a gray level.
+    kinds += {"f": ["value"], "u": []}.get(array.dtype.kind, ["range"])
     kinds += ["negative"] if negative else []
     kind = data.draw(st.sampled_from(kinds))
     if kind == "dtype":

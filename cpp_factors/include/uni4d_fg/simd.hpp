@@ -1,4 +1,4 @@
-// SIMD types: eight doubles, one factor per lane, and four doubles.
+// SIMD types: eight doubles, one factor per lane, four doubles, and sixteen floats.
 #pragma once
 
 #include <cmath>
@@ -32,54 +32,58 @@ namespace uni4d_fg {
 
 constexpr int kSimd8Width = 8;
 constexpr int kSimd4Width = 4;
+constexpr int kSimdFloatWidth = 16;
 
 #if defined(__GNUC__) || defined(__clang__)
 
 typedef double Simd8 __attribute__((vector_size(64)));
 typedef double Simd4 __attribute__((vector_size(32)));
+typedef float SimdFloat __attribute__((vector_size(64)));
 
 #else
 
-template <int width>
+template <typename T, int width>
 struct Simd {
-  double lane[width];
-  double& operator[](int i) { return lane[i]; }
-  double operator[](int i) const { return lane[i]; }
+  using value_type = T;
+  T lane[width];
+  T& operator[](int i) { return lane[i]; }
+  T operator[](int i) const { return lane[i]; }
 };
-#define UNI4D_FG_SIMD_OPERATOR(op)                                        \
-  template <int width>                                                    \
-  Simd<width> operator op(const Simd<width>& a, const Simd<width>& b) {   \
-    Simd<width> out;                                                      \
-    for (int i = 0; i < width; ++i) out.lane[i] = a.lane[i] op b.lane[i]; \
-    return out;                                                           \
-  }                                                                       \
-  template <int width>                                                    \
-  Simd<width> operator op(double a, const Simd<width>& b) {               \
-    Simd<width> out;                                                      \
-    for (int i = 0; i < width; ++i) out.lane[i] = a op b.lane[i];         \
-    return out;                                                           \
-  }                                                                       \
-  template <int width>                                                    \
-  Simd<width> operator op(const Simd<width>& a, double b) {               \
-    Simd<width> out;                                                      \
-    for (int i = 0; i < width; ++i) out.lane[i] = a.lane[i] op b;         \
-    return out;                                                           \
+#define UNI4D_FG_SIMD_OPERATOR(op)                                                             \
+  template <typename T, int width>                                                             \
+  Simd<T, width> operator op(const Simd<T, width>& a, const Simd<T, width>& b) {               \
+    Simd<T, width> out;                                                                        \
+    for (int i = 0; i < width; ++i) out.lane[i] = a.lane[i] op b.lane[i];                      \
+    return out;                                                                                \
+  }                                                                                            \
+  template <typename T, int width>                                                             \
+  Simd<T, width> operator op(typename Simd<T, width>::value_type a, const Simd<T, width>& b) { \
+    Simd<T, width> out;                                                                        \
+    for (int i = 0; i < width; ++i) out.lane[i] = a op b.lane[i];                              \
+    return out;                                                                                \
+  }                                                                                            \
+  template <typename T, int width>                                                             \
+  Simd<T, width> operator op(const Simd<T, width>& a, typename Simd<T, width>::value_type b) { \
+    Simd<T, width> out;                                                                        \
+    for (int i = 0; i < width; ++i) out.lane[i] = a.lane[i] op b;                              \
+    return out;                                                                                \
   }
 UNI4D_FG_SIMD_OPERATOR(+)
 UNI4D_FG_SIMD_OPERATOR(-)
 UNI4D_FG_SIMD_OPERATOR(*)
 UNI4D_FG_SIMD_OPERATOR(/)
 #undef UNI4D_FG_SIMD_OPERATOR
-template <int width>
-Simd<width> operator-(const Simd<width>& a) {
-  return -1.0 * a;
+template <typename T, int width>
+Simd<T, width> operator-(const Simd<T, width>& a) {
+  return T(-1) * a;
 }
-template <int width>
-Simd<width>& operator+=(Simd<width>& a, const Simd<width>& b) {
+template <typename T, int width>
+Simd<T, width>& operator+=(Simd<T, width>& a, const Simd<T, width>& b) {
   return a = a + b;
 }
-using Simd8 = Simd<kSimd8Width>;
-using Simd4 = Simd<kSimd4Width>;
+using Simd8 = Simd<double, kSimd8Width>;
+using Simd4 = Simd<double, kSimd4Width>;
+using SimdFloat = Simd<float, kSimdFloatWidth>;
 
 #endif
 
@@ -95,6 +99,20 @@ UNI4D_FG_INLINE void store_simd8(const Simd8& a, double* p) { std::memcpy(p, &a,
 
 /// Read four doubles; no alignment needed.
 UNI4D_FG_INLINE void load_simd4(const double* p, Simd4& out) { std::memcpy(&out, p, sizeof(Simd4)); }
+
+/// Read sixteen floats; no alignment needed.
+UNI4D_FG_INLINE SimdFloat load_floats(const float* p) {
+  SimdFloat out;
+  std::memcpy(&out, p, sizeof(SimdFloat));
+  return out;
+}
+
+/// Sum of the lanes, always in the same order.
+UNI4D_FG_INLINE double sum(const SimdFloat& a) {
+  float part[4];
+  for (int i = 0; i < 4; ++i) part[i] = (a[i] + a[i + 4]) + (a[i + 8] + a[i + 12]);
+  return (static_cast<double>(part[0]) + part[1]) + (static_cast<double>(part[2]) + part[3]);
+}
 
 UNI4D_FG_INLINE double sum(const Simd4& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
 

@@ -83,7 +83,7 @@ class FirstViews:
             kept: (N,) True for the M points that passed; the views of the others are forgotten.
             moved: (M, 2) their pixels in ``target``.
         """
-        refined, gray = np.empty_like(points), target.astype(np.float64)
+        refined = np.empty_like(points)
 
         def accept(rows: IntArray, moved: Float32Array, expected: Float32Array) -> BoolArray:
             found = np.zeros(len(rows), np.bool_)
@@ -91,7 +91,7 @@ class FirstViews:
             looked = np.flatnonzero(due)
             chosen = rows[looked]
             warp, correlation = register(
-                self.templates, self.row[chosen], gray, np.concatenate((moved[looked], self.affine[chosen]), axis=1)
+                self.templates, self.row[chosen], target, np.concatenate((moved[looked], self.affine[chosen]), axis=1)
             )
             found[looked] = seen = _is_found(warp, correlation, moved[looked], target, self.config)
             refined[chosen[seen]], self.affine[chosen[seen]] = warp[seen, :2], warp[seen, 2:]

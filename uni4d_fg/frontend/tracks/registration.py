@@ -12,6 +12,7 @@ Source: Baker and Matthews 2004, "Lucas-Kanade 20 years on"; Shi and Tomasi 1994
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
@@ -28,7 +29,7 @@ _CHUNK = 512
 
 
 def cut_templates(image: ImageArray, points: Float32Array, patch_px: int) -> Float32Array:
-    """Return gray levels (N, P + 2, P + 2) around points, bilinear, NaN outside of the image.
+    """Return gray levels (N, P + 2, P + 2) around points, bilinear, NaN outside of the image and of points outside.
 
     Args:
         image: (H, W) uint8.
@@ -37,19 +38,24 @@ def cut_templates(image: ImageArray, points: Float32Array, patch_px: int) -> Flo
     """
     reach = patch_px // 2 + 1
     height, width = image.shape
-    whole = np.floor(points)
-    # One place between four pixels for all of a patch, whose gray levels are gathered once.
+    # One place between four pixels for all of a patch, whose gray levels come in one piece from an image with a frame.
+    last = np.array((width - 1, height - 1), np.float32)
+    whole = np.clip(np.floor(points), 0, last)
+    framed = cv2.copyMakeBorder(image, reach, reach + 1, reach, reach + 1, cv2.BORDER_REPLICATE)
+    side = 2 * reach + 2
+    column, row = whole.astype(np.int64).T
+    levels = np.lib.stride_tricks.sliding_window_view(framed, (side, side))[row, column].astype(np.float32)
     fu, fv = (points - whole)[:, 0, None, None], (points - whole)[:, 1, None, None]
-    offset = np.arange(-reach, reach + 2)
-    column, row = whole[:, :1].astype(np.int64) + offset, whole[:, 1:].astype(np.int64) + offset
-    flat = image.reshape(-1).astype(np.float32)
-    at = (np.clip(row, 0, height - 1) * width)[:, :, None] + np.clip(column, 0, width - 1)[:, None, :]
-    levels = flat[at]
     across = levels[:, :, :-1] + fu * (levels[:, :, 1:] - levels[:, :, :-1])
     templates: Float32Array = across[:, :-1] + fv * (across[:, 1:] - across[:, :-1])
-    u, v = points[:, :1] + offset[:-1], points[:, 1:] + offset[:-1]
-    outside = ((v < 0) | (v > height - 1))[:, :, None] | ((u < 0) | (u > width - 1))[:, None, :]
-    templates[outside] = np.nan
+    # Few patches leave the image: pixels are looked at in these only.
+    rows = np.flatnonzero(((points < reach) | (points > last - reach)).any(axis=1))
+    place = points[rows, None, :] + np.arange(-reach, reach + 1, dtype=np.float32)[:, None]
+    out_u, out_v = np.moveaxis((place < 0) | (place > last), 2, 0)
+    gone = ((points[rows] < 0) | (points[rows] > last)).any(axis=1)
+    edge = templates[rows]
+    edge[out_v[:, :, None] | out_u[:, None, :] | gone[:, None, None]] = np.nan
+    templates[rows] = edge
     return templates
 
 
@@ -61,7 +67,7 @@ def is_fast() -> bool:
 def register(
     templates: Float32Array,
     rows: IntArray,
-    image: ImageArray | FloatArray,
+    image: ImageArray,
     warp: FloatArray,
     use_extension: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
@@ -70,25 +76,25 @@ def register(
     Args:
         templates: (M, P + 2, P + 2) of :func:`cut_templates`.
         rows: (N,) which of them.
-        image: (H, W) gray levels.
+        image: (H, W) uint8.
         warp: (N, 6) where to start: u, v in px and the affine part by rows.
-        use_extension: Use the C++ extension if it is installed; the result is the same up to rounding.
+        use_extension: Use the C++ extension if it is installed; the result is the same up to rounding to floats.
 
     Returns:
         The warps (N, 6), and the correlations (N,) there; -1 where a template has too little contrast, is half outside
         of the image, or is not near.
     """
     weight = _weights(templates.shape[1] - 2)
-    gray = np.asarray(image, np.float64)
     if use_extension and is_fast():
         core = import_extension()
         found: FloatArray
         correlation: FloatArray
         found, correlation = core.register_patches(
-            templates, rows, gray, warp, weight=weight, stiffness=_STIFFNESS,
+            templates, rows, image, warp, weight=weight, stiffness=_STIFFNESS,
             max_iterations=_MAX_ITERATIONS, convergence_px=_CONVERGENCE_PX,
         )  # fmt: skip
         return found, correlation
+    gray = image.astype(np.float64)
     parts = [
         _Registration(templates[rows[n : n + _CHUNK]].astype(np.float64), gray, warp[n : n + _CHUNK], weight).solve()
         for n in range(0, len(rows), _CHUNK)
