@@ -50,12 +50,13 @@ def cut_templates(image: ImageArray, points: Float32Array, patch_px: int) -> Flo
     templates: Float32Array = across[:, :-1] + fv * (across[:, 1:] - across[:, :-1])
     # Few patches leave the image: pixels are looked at in these only.
     rows = np.flatnonzero(((points < reach) | (points > last - reach)).any(axis=1))
-    place = points[rows, None, :] + np.arange(-reach, reach + 1, dtype=np.float32)[:, None]
-    out_u, out_v = np.moveaxis((place < 0) | (place > last), 2, 0)
-    gone = ((points[rows] < 0) | (points[rows] > last)).any(axis=1)
-    edge = templates[rows]
-    edge[out_v[:, :, None] | out_u[:, None, :] | gone[:, None, None]] = np.nan
-    templates[rows] = edge
+    offset = np.arange(-reach, reach + 1, dtype=np.float32)
+    u, v = points[rows, :1] + offset, points[rows, 1:] + offset
+    outside = ((v < 0) | (v > height - 1))[:, :, None] | ((u < 0) | (u > width - 1))[:, None, :]
+    outside[((points[rows] < 0) | (points[rows] > last)).any(axis=1)] = True
+    leaving = templates[rows]
+    leaving[outside] = np.nan
+    templates[rows] = leaving
     return templates
 
 
