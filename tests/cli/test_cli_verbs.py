@@ -243,6 +243,31 @@ def test_an_unusable_sequence_does_not_cost_an_earlier_run(cli: Run, finished: P
     assert (finished / "reconstruction.npz").exists()
 
 
+@pytest.mark.parametrize(
+    ("verb", "words", "code"),
+    [
+        ("reconstruct", ["--window", "6", "--overlap", "3"], 2),
+        ("reconstruct", ["--overlap", "2"], 2),
+        ("reconstruct", ["--config", "paper", "--window", "6", "--overlap", "2"], 2),
+        ("reconstruct", ["--config", "paper", "--set", "camera.model=radial"], 2),
+        ("reconstruct", ["--config", "paper", "--set", "camera.zoom=on"], 2),
+        ("reconstruct", ["--set", "input.poses=fixed"], 3),
+        ("stream", ["--config", "paper"], 2),
+        ("stream", ["--set", "incremental.window=3"], 2),
+        ("stream", ["--set", "camera.model=radial"], 2),
+        ("stream", ["--odometry", "nosuch.tum"], 3),
+    ],
+)
+def test_what_cannot_be_asked_of_a_video_costs_no_run(
+    cli: Run, finished: Path, scene: Path, tmp_path: Path, verb: str, words: list[str], code: int
+) -> None:
+    kept = (finished / "summary.json").read_bytes()
+    assert cli(verb, scene, "--out", finished, "--overwrite", *words)[0] == code
+    assert (finished / "summary.json").read_bytes() == kept
+    assert cli(verb, scene, "--out", tmp_path / "run", *words)[0] == code
+    assert not (tmp_path / "run" / "run.json").exists()  # the corrected command may write there
+
+
 def test_evaluate_finds_the_sequence_of_the_run(cli: Run, finished: Path, scene: Path) -> None:
     code, out, _ = cli("evaluate", finished)
     assert code == 0

@@ -81,6 +81,7 @@ def reconstruct(
     from uni4d_fg.config.load import load_config
     from uni4d_fg.cues.intermediate import drop_intermediate
     from uni4d_fg.frontend.measurements.imu import read_imu
+    from uni4d_fg.pipeline.asked import check_asked
     from uni4d_fg.pipeline.inertial import check_goes_with_imu
     from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
     from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -96,6 +97,8 @@ def reconstruct(
         work = WorkerOptions(workers, scheduler, time_limit=60.0 * time_limit)
     if work is not None and settings.windows.frames is None:
         raise ConfigError("--workers and --scheduler are for the windows of a long video: add --window N")
+    if overlap is not None and settings.windows.frames is None:
+        raise ConfigError("--overlap is for the windows of a long video: add --window N")
     source = SequenceInput.of(
         seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics,
         intrinsics=intrinsics, start=start, stop=stop, stride=stride, max_size=max_size, depth_model=depth_model,
@@ -109,6 +112,7 @@ def reconstruct(
         samples.check_covers(opened.video.timestamps)
     plan = source.plan(opened)
     plan.check()
+    check_asked(opened.video, settings)
     files = MeasurementFiles(odometry, gps, relative_poses)
     is_measured = any(given is not None for given in (imu, odometry, gps, relative_poses))
     # What is wrong with a file is said before anything is made.

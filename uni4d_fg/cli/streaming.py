@@ -52,8 +52,8 @@ def stream(
 ) -> None:
     """Reconstruct frame by frame over a sliding window: cameras, static and moving points of a video of any length."""
     from uni4d_fg.config.load import load_config
-    from uni4d_fg.pipeline.measurements import MeasurementFiles
-    from uni4d_fg.pipeline.stream import stream_sequence
+    from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
+    from uni4d_fg.pipeline.stream import check_stream, stream_sequence
 
     settings = load_config(config, changes or ())
     if masks == "motion":
@@ -72,13 +72,17 @@ def stream(
     sequence = source.read()
     if online_tracks:
         sequence = replace(sequence, tracks=None)
+    files = MeasurementFiles(odometry, gps, relative_poses)
+    # What is wrong is said before an earlier run is replaced.
+    check_stream(sequence, settings)
+    read_measurements(files, sequence.timestamps, settings.measurements)
     with run_lock(run), Interruption() as interrupted, progress_reporter(quiet) as reporter:
         prepare_run_folder(run, source, resume=resume, overwrite=overwrite, whole=True)
         reporter.begin("stream", sequence.num_frames)
         try:
             summary = stream_sequence(
                 sequence, run, settings, resume=resume, on_frame=_LiveProgress(reporter), should_stop=interrupted,
-                measurements=MeasurementFiles(odometry, gps, relative_poses),
+                measurements=files,
             )  # fmt: skip
         except Cancelled as error:
             raise Cancelled(f"{error}: results so far are in {run}; continue with: {resume_command()}") from error

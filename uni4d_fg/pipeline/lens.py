@@ -12,7 +12,7 @@ import numpy.typing as npt
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, ConfigError, DegenerateProblemError, SolverError
-from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens
 from uni4d_fg.optim.levenberg_marquardt import Hooks
@@ -55,7 +55,7 @@ class CameraModel:
         )
 
 
-def is_sought(sequence: Sequence, config: Config) -> bool:
+def is_sought(sequence: Video | Sequence, config: Config) -> bool:
     """Return whether the lens, or a zoom, is estimated.
 
     That needs the likelihood of energy 'map', Levenberg-Marquardt, and poses and intrinsics that may move. A lens that
@@ -81,10 +81,16 @@ def _rules_it_out(config: Config) -> tuple[str, str] | None:
 
 
 def known_camera(sequence: Sequence, config: Config) -> CameraModel:
-    """Return the camera of a sequence whose lens is not estimated.
+    """Return the camera of a sequence whose lens is not estimated. Raises ConfigError as :func:`check_camera`."""
+    check_camera(sequence, config)
+    return CameraModel(PINHOLE if config.camera.model == "pinhole" else sequence.lens, sequence.intrinsics)
+
+
+def check_camera(sequence: Video | Sequence, config: Config) -> None:
+    """Check that what is asked for of a camera whose lens is not estimated is known.
 
     Raises:
-        ConfigError: If a model is asked for whose parameters are neither given nor to be estimated.
+        ConfigError: If a model is asked for whose parameters are neither given nor to be estimated, or a zoom.
     """
     ruled_out = _rules_it_out(config)
     if ruled_out is not None:
@@ -92,10 +98,9 @@ def known_camera(sequence: Sequence, config: Config) -> CameraModel:
         check_parameters(sequence, config, f"with {has}", f"set {wanted}")
         if config.camera.zoom == "on":
             raise ConfigError(f"camera.zoom=on: with {has} no zoom is estimated; set {wanted}, or camera.zoom=auto")
-    return CameraModel(PINHOLE if config.camera.model == "pinhole" else sequence.lens, sequence.intrinsics)
 
 
-def check_parameters(sequence: Sequence, config: Config, where: str, remedy: str) -> None:
+def check_parameters(sequence: Video | Sequence, config: Config, where: str, remedy: str) -> None:
     """Check that the parameters of a model that is asked for are known where the lens is not estimated.
 
     Raises:

@@ -37,6 +37,7 @@ from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.stage_graph import RecordingRunner
 from uni4d_fg.optim.threads import one_blas_thread, thread_limit
+from uni4d_fg.pipeline.asked import check_asked
 from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
@@ -189,6 +190,9 @@ def reconstruct(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    check_asked(sequence, config)
+    if workers is not None and config.windows.frames is None:
+        raise ConfigError("workers solve the windows of a long video: set windows.frames (`--window N`)")
     recorder = RecordingRunner(stage_runner(config))
     # Threads of BLAS wait for each other in busy loops: on a busy machine small matrices take a thousand times as long.
     # What is worth several threads divides its work itself.
@@ -206,8 +210,6 @@ def _reconstruct(
     measurements: MeasurementFiles, imu: ImuSamples | None, warnings: Iterable[str],
     workers: WorkerOptions | None,
 ) -> RunSummary:  # fmt: skip
-    if workers is not None and config.windows.frames is None:
-        raise ConfigError("workers solve the windows of a long video: set windows.frames (`--window N`)")
     measured = read_measurements(measurements, sequence.timestamps, config.measurements)
     sources = (*additions, *measured.sources)
     run_stage = with_additions(recorder, sources)

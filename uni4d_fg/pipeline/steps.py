@@ -17,7 +17,7 @@ from uni4d_fg.counted import counted
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.factors.variable_types import INTRINSICS
 from uni4d_fg.frontend.measurements.imu import ImuSamples
-from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
 from uni4d_fg.optim.added_factors import adding_to
@@ -47,7 +47,7 @@ _MAX_DEPARTURE = 0.15
 """A median |log z - log cue| of moving points above this is warned of."""
 
 
-def given_poses(sequence: Sequence, config: Config) -> FloatArray | None:
+def given_poses(sequence: Video | Sequence, config: Config) -> FloatArray | None:
     """Return the poses (T, 4, 4) that the configuration takes from the sequence; None where they are estimated.
 
     Raises:

@@ -29,7 +29,7 @@ from uni4d_fg.pipeline.warnings import scene_warnings
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
-from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor
+from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor, check_incremental
 
 OnFrame = Callable[[FrameUpdate], None]
 """Told of every frame."""
@@ -81,6 +81,18 @@ class StreamSummary:
         return out + [f"warning: {text}" for text in self.warnings()]
 
 
+def check_stream(sequence: Sequence, config: Config) -> None:
+    """Check a sequence and a configuration before a folder is touched.
+
+    Raises:
+        InputError: If parts of the sequence are missing or contradict each other.
+        ConfigError: If it cannot be solved frame by frame, or asks for a camera model whose parameters are not given.
+    """
+    check_sequence(sequence)
+    check_parameters(sequence, config, "in a stream", "find it with `uni4d-fg reconstruct`")
+    check_incremental(config)
+
+
 def stream_sequence(
     sequence: Sequence,
     run_dir: Path,
@@ -106,14 +118,13 @@ def stream_sequence(
 
     Raises:
         InputError: If a cue cannot be read, or the checkpoint does not fit.
-        ConfigError: If a camera model is asked for whose parameters are not given.
+        ConfigError: As :func:`check_stream`.
         DegenerateProblemError: If there is no frame.
         SolverError: If a window cannot be solved.
         OutputError: If a result cannot be written.
         Cancelled: If ``should_stop`` turned true.
     """
-    check_sequence(sequence)
-    check_parameters(sequence, config, "in a stream", "find it with `uni4d-fg reconstruct`")
+    check_stream(sequence, config)
     with run_lock(run_dir):
         mark_run(run_dir)
         measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)

@@ -60,6 +60,23 @@ class PendingFrame:
     ``frame`` is its number."""
 
 
+def check_incremental(config: Config) -> None:
+    """Check that a configuration can be solved in a window that moves.
+
+    Raises:
+        ConfigError: If it cannot.
+    """
+    if config.energy != "map" or config.solver != "lm":
+        raise ConfigError("incremental solving is made for energy 'map' and solver 'lm'; the paper's norms have no "
+                          "information to marginalize: choose the preset 'default' or 'fast'")  # fmt: skip
+    incremental = config.incremental
+    if not incremental.nonrigid_lag + 2 <= min(incremental.nonrigid_window, incremental.window + 1):
+        raise ConfigError(
+            f"incremental.nonrigid_lag {incremental.nonrigid_lag} must be at least 2 less than nonrigid_window "
+            f"{incremental.nonrigid_window} and less than window {incremental.window}"
+        )
+
+
 class IncrementalReconstructor:
     """Solves a video frame by frame over a sliding window.
 
@@ -86,15 +103,7 @@ class IncrementalReconstructor:
         additions: Iterable[FactorSource] = (),
         lens: Lens = PINHOLE,
     ):
-        if config.energy != "map" or config.solver != "lm":
-            raise ConfigError("incremental solving is made for energy 'map' and solver 'lm'; the paper's norms have no "
-                              "information to marginalize: choose the preset 'default' or 'fast'")  # fmt: skip
-        incremental = config.incremental
-        if not incremental.nonrigid_lag + 2 <= min(incremental.nonrigid_window, incremental.window + 1):
-            raise ConfigError(
-                f"incremental.nonrigid_lag {incremental.nonrigid_lag} must be at least 2 less than nonrigid_window "
-                f"{incremental.nonrigid_window} and less than window {incremental.window}"
-            )
+        check_incremental(config)
         intrinsics = np.array(intrinsics, dtype=np.float64)
         if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
             raise InputError(f"intrinsics must be fx, fy, cx, cy in px with positive focal lengths, got {intrinsics}")
@@ -107,7 +116,7 @@ class IncrementalReconstructor:
         self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise, sources=tuple(additions))
         self.dynamic = DynamicWindow(config, depth_sigma=ba.depth_sigma)
         self.book = TrackBook()
-        self.tracker = OnlineTracker(config.tracking, incremental.max_live_tracks)
+        self.tracker = OnlineTracker(config.tracking, config.incremental.max_live_tracks)
         self.pending: list[PendingFrame] = []
         self.results: Results = ResultsInMemory() if results is None else results
         self.num_frames = 0
@@ -115,7 +124,7 @@ class IncrementalReconstructor:
         self.last_pose = np.eye(4)
         self._boundary = Boundary(self.image_size)
         self._run = LevenbergMarquardtRunner(choose_backend(config.backend))
-        self.smoother = make_smoother(incremental, self._run)
+        self.smoother = make_smoother(config.incremental, self._run)
         self._seconds: dict[str, float] = {}
 
     @property

@@ -44,7 +44,9 @@ def plan_windows(num_frames: int, frames: int, overlap: int) -> list[Window]:
         ConfigError: If the overlap is more than a third of the frames.
     """
     if 3 * overlap > frames:
-        raise ConfigError(f"windows.overlap {overlap} must be at most a third of windows.frames {frames}")
+        raise ConfigError(
+            f"windows.overlap {overlap} must be at most a third of windows.frames {frames}: give {frames // 3} or less"
+        )
     if num_frames <= frames:
         return [Window(0, num_frames)]
     count = -(-(num_frames - overlap) // (frames - overlap))
