@@ -90,7 +90,16 @@ def test_a_stream_warns_of_what_a_batch_run_warns_of() -> None:
         found = scene_warnings(given, given, poses, points, covariance)
         assert [text.split(":")[0] for text in found] == expected
     assert scene_warnings(given, given, poses, points, np.full((3, 6, 6), np.nan)) == []
-    assert "moves by only 0.00 %" in scene_warnings(given, given, np.tile(np.eye(4), (3, 1, 1)), points)[0]
+    still = np.tile(np.eye(4), (3, 1, 1))
+    assert "moves by only 0.00 %" in scene_warnings(given, given, still, points)[0]
+
+
+@pytest.mark.parametrize(("sigma_px", "poor"), [(0.0, False), (3.0, False), (16.0, True), (np.nan, True)])
+def test_a_camera_at_rest_determines_its_focal_length_if_it_turns(sigma_px: float, poor: bool) -> None:
+    given, still = np.array([160.0, 160.0, 80.0, 60.0]), np.tile(np.eye(4), (3, 1, 1))
+    covariance = np.diag([sigma_px**2, sigma_px**2, 0.0, 0.0])
+    found = scene_warnings(given, given, still, np.array([[0.0, 0.0, 5.0]]), None, covariance)
+    assert ["focal length is poorly determined" in text for text in found] == [poor]
 
 
 def test_a_stream_without_static_tracks_says_so(tmp_path: Path) -> None:

@@ -202,8 +202,9 @@ def bundle_summary(
         f"fx {fx:.1f} fy {fy:.1f} px, noise {pixel:.2f} px, depth {100 * relative:.1f} %"
     ]
     warnings = scene_warnings(
-        sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"]
-    )
+        sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
+        arrays["intrinsics_covariance"],
+    )  # fmt: skip
     warnings += unmasked_motion_warnings(
         labelled, arrays["landmark_track"], arrays["landmark_error"], float(pixel), max(sequence.image_size)
     )

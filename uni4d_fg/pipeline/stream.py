@@ -177,8 +177,9 @@ def _stream(
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began
     doubts = scene_warnings(
-        sequence.intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks
-    )
+        sequence.intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
+        intrinsics_covariance=reconstruction.intrinsics_covariance,
+    )  # fmt: skip
     facts = []
     if closing is not None:
         seconds["loops"], facts = closing.seconds, closing.facts()

@@ -10,6 +10,8 @@ from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 _MAX_FOCAL_CHANGE = 0.15
 _MIN_BASELINE = 0.01
 """Of the scene's depth."""
+_MAX_FOCAL_SIGMA = 0.04
+"""Standard deviation, of the focal length, above which it counts as poorly determined."""
 _MAX_UNCERTAINTY = 0.05
 """Root mean square of the positions' sigmas, of the path's length: a path that may be off by a twentieth of itself."""
 
@@ -75,6 +77,7 @@ def scene_warnings(
     world_T_cam: FloatArray,
     landmarks: FloatArray,
     pose_covariance: FloatArray | None = None,
+    intrinsics_covariance: FloatArray | None = None,
 ) -> list[str]:
     """Return one sentence for everything that makes a static scene doubtful.
 
@@ -84,6 +87,7 @@ def scene_warnings(
         world_T_cam: (T, 4, 4) poses.
         landmarks: (N, 3) world, meters.
         pose_covariance: (T, 6, 6) of the poses' twists, translation last; NaN where it is not known.
+        intrinsics_covariance: (4, 4) of ``intrinsics``, px^2; zero where they were held, NaN where it is not known.
     """
     warnings = focal_warnings(given_intrinsics, intrinsics[:2])
     if not len(landmarks):
@@ -92,10 +96,12 @@ def scene_warnings(
     baseline = float(np.linalg.norm(world_T_cam[:, :3, 3] - first, axis=1).max())
     depth = float(np.median(np.linalg.norm(landmarks - first, axis=1)))
     if baseline < _MIN_BASELINE * depth:
-        warnings.append(
-            f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
-            "depth comes from the cue alone, and the focal length is poorly determined"
-        )
+        text = f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
+        text += "depth comes from the cue alone"
+        # A camera that turns on the spot determines its focal length; one that is held needs no determining.
+        if intrinsics_covariance is None or not _determine_focal(intrinsics_covariance, intrinsics):
+            text += ", and the focal length is poorly determined"
+        warnings.append(text)
     elif pose_covariance is not None and len(world_T_cam) > 1:
         path = float(np.linalg.norm(np.diff(world_T_cam[:, :3, 3], axis=0), axis=1).sum())
         variance = np.einsum("nii->n", pose_covariance[1:, 3:, 3:])
@@ -106,3 +112,8 @@ def scene_warnings(
                 "static is seen well; look at masks, tracks and the share of the image that moves"
             )
     return warnings
+
+
+def _determine_focal(covariance: FloatArray, intrinsics: FloatArray) -> bool:
+    """Return whether a covariance (4, 4), px^2, leaves the focal lengths little room; not where it is not known."""
+    return bool((np.sqrt(np.diagonal(covariance)[:2]) <= _MAX_FOCAL_SIGMA * intrinsics[:2]).all())
