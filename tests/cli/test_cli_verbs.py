@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -241,6 +242,18 @@ def test_overwrite_replaces_results_and_nothing_else(cli: Run, scene: Path, tmp_
 def test_an_unusable_sequence_does_not_cost_an_earlier_run(cli: Run, finished: Path, tmp_path: Path) -> None:
     assert cli("reconstruct", tmp_path / "nosuch", "--out", finished, "--overwrite")[0] == 3
     assert (finished / "reconstruction.npz").exists()
+
+
+@pytest.mark.parametrize("verb", ["reconstruct", "stream"])
+def test_frames_that_may_be_in_another_order_are_warned_of(cli: Run, scene: Path, tmp_path: Path, verb: str) -> None:
+    """``ffmpeg -i clip.mp4 rgb/%d.png`` writes 10 before 2 in the order of names."""
+    folder = Path(shutil.copytree(scene, tmp_path / "room"))
+    for name in ("rgb", "depth_cue", "masks"):
+        for index, path in enumerate(sorted((folder / name).iterdir())):
+            path.rename(path.with_name(f"{3 * index + 1}{path.suffix}"))  # 1, 4, ..., 22
+    assert cli(verb, folder, "--out", tmp_path / "run", "--config", "fast")[0] == 0
+    warnings = json.loads((tmp_path / "run" / "summary.json").read_text())["warnings"]
+    assert len([text for text in warnings if "in which 22 comes before 4;" in text]) == 1
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.bars import bars_note, without_bars
 from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.naming import order_warnings
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.io import save_tracks
@@ -229,7 +230,7 @@ def _reconstruct(
         },
         solver_facts(config),
         cues=cues,
-        warnings=[*cues.get("warnings", []), *measured.warnings, *warnings],
+        warnings=[*order_warnings(sequence.frame_names), *cues.get("warnings", []), *measured.warnings, *warnings],
     )
     on = None
     if windows and not sources:

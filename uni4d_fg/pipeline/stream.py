@@ -15,6 +15,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.files import atomic_write_json, atomic_write_text, remove_file
 from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.naming import order_warnings
 from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.pipeline.assemble import write_result
 from uni4d_fg.pipeline.checks import check_sequence
@@ -131,7 +132,9 @@ def stream_sequence(
         sources = (*additions, *measured.sources)
         summary = _stream(sequence, run_dir, config, resume, on_frame, should_stop, sources)
         summary = replace(
-            summary, facts=[*summary.facts, *measured.facts], doubts=[*summary.doubts, *measured.warnings]
+            summary,
+            facts=[*summary.facts, *measured.facts],
+            doubts=[*order_warnings(sequence.frame_names), *summary.doubts, *measured.warnings],
         )
         atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
         return summary

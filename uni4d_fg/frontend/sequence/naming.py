@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,23 +12,39 @@ from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.sequence.scan import Findings
 
 _REGULAR_SHARE = 0.8
+_REMEDY = "pad the numbers with zeros if the video runs in another order"
+
+
+def order_warnings(stems: Sequence[str]) -> list[str]:
+    """Return a sentence if the numbers that end file names do not increase in the order in which frames are taken."""
+    doubt = _unordered(stems)
+    return [] if doubt is None else [f"{doubt}; {_REMEDY}"]
+
+
+def _unordered(stems: Sequence[str]) -> str | None:
+    numbers = _numbers(stems)
+    steps = np.diff(numbers) if numbers is not None else np.empty(0)
+    if not (steps <= 0).any():
+        return None
+    at = int(np.flatnonzero(steps <= 0)[0])
+    return f"files are taken in the order of their names, in which {stems[at]} comes before {stems[at + 1]}"
+
+
+def _numbers(stems: Sequence[str]) -> list[int] | None:
+    """Return what :func:`frame_numbers` does; None also where points may make the names those of times."""
+    return None if any("." in stem for stem in stems) else frame_numbers(stems)
 
 
 def check_numbering(stems: list[str], findings: Findings) -> None:
     """Warn of numbers that do not increase in name order, and of missing frames."""
-    numbers = frame_numbers(stems)
-    if numbers is None or len(numbers) < 2 or any("." in stem for stem in stems):
+    doubt = _unordered(stems)
+    if doubt is not None:
+        findings.add("warning", "images", doubt, _REMEDY)
+        return
+    numbers = _numbers(stems)
+    if numbers is None or len(numbers) < 2:
         return
     steps = np.diff(numbers)
-    if (steps <= 0).any():
-        at = int(np.flatnonzero(steps <= 0)[0])
-        findings.add(
-            "warning",
-            "images",
-            f"files are taken in the order of their names, in which {stems[at]} comes before {stems[at + 1]}",
-            "pad the numbers with zeros if the video runs in another order",
-        )
-        return
     step, times = Counter(steps.tolist()).most_common(1)[0]
     gaps = np.flatnonzero(steps != step)
     if gaps.size and times >= _REGULAR_SHARE * len(steps):
@@ -55,8 +72,8 @@ def check_pairing(item: str, stems: list[str], image_stems: list[str], findings:
             "give exactly one file per image",
         )
         return
-    own, images = frame_numbers(stems), frame_numbers(image_stems)
-    if own is None or images is None or any("." in stem for stem in (*stems, *image_stems)):
+    own, images = _numbers(stems), _numbers(image_stems)
+    if own is None or images is None:
         return
     offsets = np.array(own) - np.array(images)
     # A constant offset is another way of counting, unless both count alike and a file lacks at one end.
