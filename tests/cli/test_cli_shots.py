@@ -116,3 +116,13 @@ def test_one_shot_refuses_to_split_and_warns(cli: Run, joined: Path, split: Path
     assert not (run / "shots").exists()
     assert not (run / "shots.json").exists()
     assert (run / "reconstruction.npz").is_file()
+
+
+def test_a_video_without_a_shot_of_any_length_is_an_error(cli: Run, joined: Path, tmp_path: Path) -> None:
+    """It was taken for reconstructed: exit status 0, and a folder of nothing."""
+    words = ["reconstruct", joined, "--out", tmp_path / "run", "--start", FRAMES - 3, "--stop", FRAMES + 4, *QUICK]
+    code, out, err = cli(*words)
+    assert (code, out) == (3, "")
+    assert f"only {FRAMES - 3} to {FRAMES - 1}, {FRAMES} to {FRAMES + 3}; solve it as one with --one-shot" in err
+    assert cli(*words, "--one-shot")[0] == 0  # nothing is in the way of the corrected command
+    assert cli(*words, "--one-shot")[0] == 6

@@ -20,11 +20,18 @@ from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.sequence.read import detect_layout, read_sequence
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
 from uni4d_fg.reading import expanded, is_present, read_text, resolved
-from uni4d_fg.results.run_contents import is_free, is_run, mark_run, remove_leftovers, remove_results
+from uni4d_fg.results.run_contents import (
+    STORED_INPUT,
+    is_barely_begun,
+    is_free,
+    is_run,
+    mark_run,
+    remove_leftovers,
+    remove_results,
+)
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.results.summary_file import read_summary
 
-STORED_INPUT = "input.json"
 DEMO_SEQUENCE = "sequence"
 CUE_FOLDER = "cues"
 
@@ -252,7 +259,7 @@ def prepare_run_folder(
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; choose another --out")
     try:
-        free = is_free(folder)
+        free = is_free(folder) or is_barely_begun(folder)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be read ({error.strerror}); choose another --out") from error
     if free:

@@ -13,7 +13,8 @@ from uni4d_fg.cli.console import one_line, print_error, print_json
 from uni4d_fg.cli.interruption import Interruption, resume_command
 from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder, shot_of
 from uni4d_fg.config.shots import ShotsConfig
-from uni4d_fg.errors import Cancelled, OutputError, Uni4dFgError
+from uni4d_fg.errors import Cancelled, InputError, OutputError, Uni4dFgError
+from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
 from uni4d_fg.frontend.shots.cuts import Cut, find_cuts
 from uni4d_fg.results.run_contents import run_lock
@@ -39,7 +40,11 @@ def cuts_of(video: Video, config: ShotsConfig) -> tuple[Cut, ...]:
 
 
 def shots_between(cuts: tuple[Cut, ...], source: SequenceInput, num_frames: int, min_frames: int) -> list[Shot]:
-    """Return the shots of a video, those that are too short without a folder."""
+    """Return the shots of a video, those that are too short without a folder.
+
+    Raises:
+        InputError: If all of them are too short.
+    """
     begins, ends = [0, *(cut.start for cut in cuts)], [*(cut.stop for cut in cuts), num_frames]
     shots: list[Shot] = []
     for begin, end in zip(begins, ends, strict=True):
@@ -51,6 +56,12 @@ def shots_between(cuts: tuple[Cut, ...], source: SequenceInput, num_frames: int,
         message = f"left out: it has fewer than {min_frames} frames (shots.min_frames)" if short else ""
         folder = None if short else shot_folder(len(shots))
         shots.append(Shot(folder, part.start, part.stop, end - begin, message=message))
+    if all(shot.folder is None for shot in shots):
+        raise InputError(
+            f"{source.root}: its cuts leave no shot of {min_frames} frames (shots.min_frames), only "
+            f"{some_of([f'{shot.start} to {shot.stop - 1}' for shot in shots], 3)}; solve it as one with --one-shot if "
+            "these are no cuts"
+        )
     return shots
 
 

@@ -23,6 +23,8 @@ except ImportError:  # not a POSIX system
     fcntl = None  # type: ignore[assignment]
 
 MARKER = "run.json"
+STORED_INPUT = "input.json"
+"""What the run is made from; the second file that the command line writes."""
 EXPORT_MARKER = "export.json"
 """In the folder of every export; names its files, and says that they may be replaced."""
 
@@ -31,7 +33,7 @@ _MAX_MARKER_BYTES = 64 * 1024**2
 
 _TEMPORARY = re.compile(r"\.tmp-[0-9a-f]{8}-(?P<name>.+)")
 _ROOT_FILES = (
-    MARKER, "input.json", "config.yaml", "summary.json", "reconstruction.npz", "trajectory.tum", "depth.npy",
+    MARKER, STORED_INPUT, "config.yaml", "summary.json", "reconstruction.npz", "trajectory.tum", "depth.npy",
     "confidence.npy", "labels.npz", "report.html", "shots.json",
 )  # fmt: skip
 _KNOWN = {
@@ -76,6 +78,11 @@ def is_free(root: Path) -> bool:
     if not root.is_dir():
         return not os.path.lexists(root)
     return all(is_temporary(path) for path in root.iterdir())
+
+
+def is_barely_begun(root: Path) -> bool:
+    """Tell whether a run ended before it made anything: it is marked, and says at most what it was to be made from."""
+    return is_run(root) and all(path.name in (MARKER, STORED_INPUT) or is_temporary(path) for path in root.iterdir())
 
 
 def remove_leftovers(root: Path) -> None:
