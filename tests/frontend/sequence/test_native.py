@@ -397,3 +397,19 @@ def test_ids_that_do_not_fit(tmp_path: Path, identity: int) -> None:
     with pytest.raises(OutputError, match="use ids from 0 to 16777215"):
         write_native(dataclasses.replace(sample_sequence(), masks=masks), tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("unknown", [np.nan, -np.inf])
+def test_a_true_pose_may_be_unknown_and_a_pose_to_start_from_not(tmp_path: Path, unknown: float) -> None:
+    root = native_folder(tmp_path)
+    poses = np.load(root / "c2w.npy")
+    poses[1] = unknown
+    np.save(root / "c2w.npy", poses)
+    found = read_native(root).ground_truth.world_T_cam
+    assert found is not None
+    np.testing.assert_array_equal(np.isnan(found).all(axis=(1, 2)), np.arange(FRAMES) == 1)
+    np.testing.assert_allclose(found[[0, 2, 3]], poses[[0, 2, 3]], atol=1e-12)
+    assert validate_sequence(root).ok
+    np.save(root / "world_T_cam_init.npy", poses)
+    with pytest.raises(InputError, match=r"world_T_cam_init\.npy: has NaN or infinite entries in frame\(s\) 1"):
+        read_native(root)

@@ -250,5 +250,5 @@ def _assemble_truth(
         except VaryingIntrinsics:
             # One camera cannot be compared with a zoom; the rest of the sequence is still of use.
             truth = GroundTruth()
-    poses = None if files.true_poses is None else load_poses(files.true_poses, num_frames)
+    poses = None if files.true_poses is None else load_poses(files.true_poses, num_frames, may_lack=True)
     return replace(truth, world_T_cam=poses, depths=depths, masks=masks)

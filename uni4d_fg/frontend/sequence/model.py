@@ -48,7 +48,7 @@ class GroundTruth:
     """What is known of the truth; every field may be absent. Used by evaluation only, never by the solver."""
 
     world_T_cam: FloatArray | None = None
-    """(T, 4, 4) camera to world, OpenCV axes, meters."""
+    """(T, 4, 4) camera to world, OpenCV axes, meters; NaN where unknown."""
     depths: FrameSource[Float32Array] | None = None
     """T maps (H, W), meters; NaN where unknown."""
     masks: FrameSource[Int32Array] | None = None

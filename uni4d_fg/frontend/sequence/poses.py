@@ -16,7 +16,7 @@ MAX_ROTATION_ERROR = 1e-3
 """Largest entry of R R^T - I that is taken for rounding (and removed)."""
 
 
-def load_poses(path: Path, num_frames: int) -> FloatArray:
+def load_poses(path: Path, num_frames: int, *, may_lack: bool = False) -> FloatArray:
     """Read camera-to-world poses.
 
     A bottom row of zeros, as some programs write, is repaired; rounding of the rotations is removed.
@@ -24,9 +24,10 @@ def load_poses(path: Path, num_frames: int) -> FloatArray:
     Args:
         path: ``.npy`` file of (T, 4, 4), camera to world, OpenCV axes, meters.
         num_frames: T.
+        may_lack: Take a frame of which the first three rows are all NaN or infinite for one whose pose is unknown.
 
     Returns:
-        (T, 4, 4) rigid transforms.
+        (T, 4, 4) rigid transforms; NaN where unknown.
 
     Raises:
         InputError: If the file cannot be read, has another shape, or holds anything but rigid transforms.
@@ -37,7 +38,10 @@ def load_poses(path: Path, num_frames: int) -> FloatArray:
             path, f"has shape {stored.shape} for {num_frames} frames", f"save poses as ({num_frames}, 4, 4)"
         )
     poses: FloatArray = np.array(stored, dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
+    finite = np.isfinite(poses)
+    unknown = ~finite[:, :3].any(axis=(1, 2)) if may_lack else np.zeros(num_frames, dtype=bool)
+    poses[unknown] = np.eye(4)
+    bad = np.flatnonzero(~(finite.all(axis=(1, 2)) | unknown))
     if bad.size:
         raise SequenceProblem(
             path,
@@ -67,6 +71,7 @@ def load_poses(path: Path, num_frames: int) -> FloatArray:
     rounded = error > 1e-12
     poses[rounded] = orthonormalize(poses[rounded])
     poses[:, 3] = (0.0, 0.0, 0.0, 1.0)
+    poses[unknown] = np.nan
     return poses
 
 

@@ -89,7 +89,7 @@ class _Validation:
         if files.initial_poses is not None:
             self._array("initial poses", lambda path: load_poses(path, num_frames), files.initial_poses)
         if files.true_poses is not None:
-            self._array("true poses", lambda path: load_poses(path, num_frames), files.true_poses)
+            self._array("true poses", lambda path: load_poses(path, num_frames, may_lack=True), files.true_poses)
         if files.true_depth is not None:
             self._depth("true depth", files.true_depth, files.true_depth_units_per_meter)
         if files.true_masks is not None:
