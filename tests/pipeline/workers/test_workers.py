@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,7 @@ from uni4d_fg.pipeline.workers import cluster
 from uni4d_fg.pipeline.workers.cluster import open_workers
 from uni4d_fg.pipeline.workers.memory import free_bytes, reconstruction_bytes, worker_count
 from uni4d_fg.pipeline.workers.options import WorkerOptions
-from uni4d_fg.pipeline.workers.spread import Lost, spread
+from uni4d_fg.pipeline.workers.spread import Lost, _next_workers, spread
 
 pytest.importorskip("distributed")
 
@@ -55,6 +56,35 @@ def test_tasks_that_die_hang_or_raise_cost_the_others_nothing(client: Any, tmp_p
     assert "its process died 2 times" in found[4].why
     assert attempts(tmp_path, 6) == [1, 2, 1, 2, 2, 1]
     assert not (tmp_path / "3.hang.txt").exists()  # it came through at last
+
+
+def test_workers_are_given_the_next_task_before_results_are_handed_out(client: Any, tmp_path: Path) -> None:
+    items = [(number, "", tmp_path) for number in range(8)]
+    traces = [tmp_path / f"{number}.hang.txt" for number in range(8)]
+    client.wait_for_workers(2, timeout=120)  # one that died in another test may still be starting
+    found = spread(client, square_or_die, items, WorkerOptions(), traces)
+    first = next(found)
+    # Two are done or waiting to be handed out; while nobody asks for more, the others still begin.
+    for _ in range(200):
+        if len(list(tmp_path.glob("*.tried"))) >= 4:
+            break
+        time.sleep(0.05)
+    begun = len(list(tmp_path.glob("*.tried")))
+    assert 4 <= begun < 8
+    assert dict([first, *found]).keys() == set(range(8))
+    assert attempts(tmp_path, 8) == [1] * 8
+
+
+def test_the_last_tasks_go_to_whoever_is_done_first() -> None:
+    workers = {"a", "b", "c"}
+    assert _next_workers(workers, [], 9) == ["a", "b", "c"]
+    assert _next_workers(workers, ["a", "b"], 9) == ["c", "a", "b"]
+    assert _next_workers(workers, ["a", "b", "c"], 9) == ["a", "b", "c"]
+    assert _next_workers(workers, ["a", "b", "c"], 5) == ["a", "b"]
+    assert _next_workers(workers, ["a", "b", "c"], 3) == []
+    assert _next_workers(workers, ["a", "a", "b"], 9) == ["c", "b"]
+    assert _next_workers(workers, ["a", "b"], 2) == ["c"]
+    assert _next_workers({"b"}, ["a", "a", "b", "b"], 9) == []
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="of glibc's allocator")

@@ -60,6 +60,8 @@ def _local(distributed: Any, options: WorkerOptions, count: int, module: str | N
         "distributed.deploy.lost-worker-timeout": _RESTART,
         # Tracks and landmarks of a part of a video are more than what Dask takes for a mistake.
         "distributed.admin.large-graph-warning-threshold": "1 GB",
+        # Dask's profiler takes the interpreter from the task a hundred times a second.
+        "distributed.worker.profile.enabled": False,
         **environment,
     }
     with (

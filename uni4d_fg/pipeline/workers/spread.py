@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from uni4d_fg.counted import counted
 from uni4d_fg.errors import Cancelled, InputError
@@ -41,8 +41,9 @@ def spread(
 ) -> Iterator[tuple[int, ResultT | Lost]]:
     """Apply a function to independent items on the workers of a client.
 
-    A worker gets a task when it has none, and that task is for it alone: one that dies takes nothing else with it, and
-    what is tried again is counted here, whatever the scheduler is told.
+    A worker works on one task at a time, and while there are many it has the next one already. One that dies takes no
+    other task with it: that which it had not begun is given to another. What is tried again is counted here, whatever
+    the scheduler is told.
 
     Args:
         client: Of :func:`~uni4d_fg.pipeline.workers.cluster.open_workers`.
@@ -63,7 +64,10 @@ def spread(
     waiting = deque(range(len(items)))
     attempts, unstarted = [0] * len(items), [0] * len(items)
     flying: dict[Any, tuple[int, str]] = {}
+    ready = _Ahead(items)
     last_seen = time.monotonic()
+    ended: list[tuple[int, ResultT | Lost]] = []
+    """Handed out once the workers have something else to do."""
     try:
         while waiting or flying:
             if should_stop is not None and should_stop():
@@ -77,24 +81,28 @@ def spread(
                     f"{counted(len(waiting) + len(flying), 'task')} must still be done: see why the workers ended "
                     "(memory?), start others, and run the same command again; finished tasks are kept"
                 )
-            idle = sorted(present - {address for _, address in flying.values()})
-            for address in idle[: len(waiting)]:
+            for address in _next_workers(present, [address for _, address in flying.values()], len(waiting)):
                 index = waiting.popleft()
                 attempts[index] += 1
                 traces[index].unlink(missing_ok=True)
                 future = client.submit(
-                    guarded, function, items[index], options.threads, options.time_limit, traces[index],
+                    guarded, function, ready.take(index), options.threads, options.time_limit, traces[index],
                     workers=[address], pure=False,
                 )  # fmt: skip
                 flying[future] = index, address
+            yield from ended
+            ended = []
+            if waiting:
+                ready.make(waiting[0])
             done = _finished(flying, distributed)
             gone = [f for f, (_, address) in flying.items() if f not in done and address not in present]
             for future in [*done, *gone]:
                 index, _ = flying.pop(future)
                 if future.status == "finished":
-                    yield index, future.result()
+                    # Fetched at once: the worker may die of what it gets next.
+                    ended.append((index, future.result()))
                 elif future.status == "error" and not isinstance(future.exception(), distributed.KilledWorker):
-                    yield index, Lost(_said(future))
+                    ended.append((index, Lost(_said(future))))
                 else:
                     client.cancel([future], force=True)
                     if not traces[index].exists() and unstarted[index] < _UNSTARTED:
@@ -105,10 +113,44 @@ def spread(
                     elif attempts[index] <= options.retries:
                         waiting.append(index)
                     else:
-                        yield index, Lost(_obituary(traces[index], attempts[index], options))
+                        ended.append((index, Lost(_obituary(traces[index], attempts[index], options))))
+        yield from ended
     finally:
         with contextlib.suppress(OSError, TimeoutError):  # the scheduler may be gone, and its tasks with it
             client.cancel(list(flying), force=True)
+
+
+class _Ahead(Generic[ItemT]):
+    """Items, of which the next is made while the workers are busy."""
+
+    def __init__(self, items: Sequence[ItemT]) -> None:
+        self._items, self._made = items, dict[int, ItemT]()
+
+    def make(self, index: int) -> None:
+        """Make an item that will be taken next."""
+        if index not in self._made:
+            self._made = {index: self._items[index]}
+
+    def take(self, index: int) -> ItemT:
+        """Return an item, which is forgotten."""
+        return self._made.pop(index) if index in self._made else self._items[index]
+
+
+def _next_workers(present: set[str], busy: list[str], waiting: int) -> list[str]:
+    """Return the workers that get the next tasks, at most one each.
+
+    Those that have none come first. The others get one ahead only while as many tasks as workers are left for later:
+    the last ones go to whoever is done first.
+
+    Args:
+        present: All workers.
+        busy: The worker of every task that is given out.
+        waiting: Number of tasks that are not.
+    """
+    tasks = Counter(busy)
+    idle = sorted(present - tasks.keys())[:waiting]
+    ahead = sorted(worker for worker in present if tasks[worker] == 1)
+    return idle + ahead[: max(waiting - len(idle) - len(present), 0)]
 
 
 def _present(client: Any) -> set[str]:
