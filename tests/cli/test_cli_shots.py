@@ -100,7 +100,7 @@ def test_verbs_go_over_the_shots_or_list_them(cli: Run, split: Path) -> None:
     code, out, _ = cli("report", split)
     assert code == 0
     assert (split / "shots" / "001" / "report.html").is_file()
-    for words in (["export", split, "--to", "tum"], ["view", split]):
+    for words in (["export", split, "--to", "tum"], ["view", split], ["graph", split]):
         code, out, err = cli(*words)
         assert (code, out) == (3, "")
         assert "shots/000" in err

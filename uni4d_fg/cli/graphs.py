@@ -24,7 +24,9 @@ def graph(
     """Show the factor graphs that a run solved: variables, factors, energies, the largest residuals."""
     from uni4d_fg.errors import ConfigError
     from uni4d_fg.results.graph_summary import stage_graphs, summarize_graph, write_dot, write_g2o
+    from uni4d_fg.results.shot_list import refuse_split
 
+    refuse_split(run)
     graphs = stage_graphs(run)
     if stage is not None and stage not in graphs:
         raise ConfigError(f"--stage {stage}: the run has {', '.join(graphs)}")

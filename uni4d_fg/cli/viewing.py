@@ -89,10 +89,10 @@ def share(
         page = write_page(
             open_run(run), out or RunFolder(run).shared_page, max_mb, frames_per_second=fps, reporter=reporter
         )
-    typer.echo(
-        f"page: {page.path}, {page.megabytes:.1f} MB, {page.frames} frames, "
-        f"{page.static_points} static and {page.moving_points} moving points"
-    )
+    points = f"{page.static_points} static and {page.moving_points} moving points"
+    if page.landmarks:
+        points = f"{page.landmarks} landmarks in the place of a cloud, which the run does not have"
+    typer.echo(f"page: {page.path}, {page.megabytes:.1f} MB, {page.frames} frames, {points}")
 
 
 def open_run(run: Path, *, unfinished: bool = False) -> Run:

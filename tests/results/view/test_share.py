@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from pathlib import Path
 
@@ -32,6 +33,21 @@ def test_the_page_keeps_its_size_and_leaves_out_points(finished_run: Path, tmp_p
     with pytest.raises(ConfigError, match="max-mb"):
         write_page(run, tmp_path / "none.html", 0.5)
     assert not (tmp_path / "none.html").exists()
+
+
+def test_landmarks_that_stand_in_for_clouds_are_counted(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A run of ``stream`` has none; the page was said to show nothing."""
+    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    shutil.rmtree(run / "clouds")
+    (run / "depth.npy").unlink()
+    landmarks = len(opened(run).reconstruction.landmarks)
+    assert 0 < landmarks < 60_000
+    assert write_page(opened(run), tmp_path / "own.html").landmarks == landmarks
+    assert main.run(["share", str(run), "--quiet"]) == 0
+    assert f"{landmarks} landmarks in the place of a cloud" in capsys.readouterr().out
+    assert write_page(opened(finished_run), tmp_path / "whole.html").landmarks == 0
 
 
 def picture(page: object) -> np.ndarray:

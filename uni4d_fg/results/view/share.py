@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from uni4d_fg.arrays import evenly_spread
+from uni4d_fg.arrays import IntArray, evenly_spread
 from uni4d_fg.errors import ConfigError, OutputError
 from uni4d_fg.files import atomic_path
 from uni4d_fg.progress import Reporter, SilentReporter
@@ -48,6 +48,8 @@ class SharedPage:
     static_points: int
     moving_points: int
     frames: int
+    landmarks: int
+    """Shown in the place of static points, where a run has none."""
 
 
 def write_page(
@@ -92,7 +94,9 @@ def write_page(
             reporter.end(f"{len(data) / MB:.1f} MB")
             with atomic_path(path) as temporary:
                 temporary.write_bytes(data)
-            return SharedPage(path, len(data) / MB, len(static.points), points - len(static.points), len(moving))
+            moving_points = points - len(static.points)
+            landmarks = len(_landmark_rows(run, static))
+            return SharedPage(path, len(data) / MB, len(static.points), moving_points, len(moving), landmarks)
         total = int(_AIM * max_mb * MB / len(data) * points)
     raise OutputError(f"{path}: the run does not fit into {max_mb:g} MB; give a larger --max-mb")
 
@@ -148,14 +152,14 @@ def _page(run: Run, static: ColoredPoints, moving: list[ColoredPoints], rate: fl
 def _recorded(server: Any, run: Run, static: ColoredPoints, moving: list[ColoredPoints], rate: float) -> Any:
     reconstruction, limits = run.reconstruction, Limits()
     depth = scene_depth(reconstruction)
-    shown = Shown(landmarks=not len(static.points), full=False)
+    rows = _landmark_rows(run, static)
+    shown = Shown(landmarks=len(rows) > 0, full=False)
     coloring = Coloring(ColorBy.image, run, values_of(run))
     view = first_view(reconstruction, depth)
     server.scene.set_up_direction(view.up)
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = view.position, view.look_at, view.up, FOV_RAD
     camera.near, camera.far = 1e-3 * depth, 1e3 * depth
-    rows = evenly_spread(len(reconstruction.landmarks), limits.landmarks if shown.landmarks else 0)
     still = StaticLayer(server, run, depth, rows)
     still.build(coloring, shown)
     still.replace_by(static, still.send(static, coloring, 1.0))
@@ -175,6 +179,11 @@ def _recorded(server: Any, run: Run, static: ColoredPoints, moving: list[Colored
         if run.num_frames > 1:
             serializer.insert_sleep(1.0 / rate)
     return serializer
+
+
+def _landmark_rows(run: Run, static: ColoredPoints) -> IntArray:
+    """Return the landmarks that stand in for static points: none where there are any."""
+    return evenly_spread(len(run.reconstruction.landmarks), 0 if len(static.points) else Limits().landmarks)
 
 
 def _rate(run: Run) -> float:
