@@ -244,6 +244,20 @@ def test_an_unusable_sequence_does_not_cost_an_earlier_run(cli: Run, finished: P
     assert (finished / "reconstruction.npz").exists()
 
 
+def test_home_folders_that_the_shell_leaves_as_they_are(
+    cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of ``--out=~/run`` a folder named ``~`` was made."""
+    (tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    assert cli("synthesize", "~/a room", "--quiet", *SCENE_OPTIONS)[0] == 0
+    assert cli("track", "~/a room", "--out=~/tracks.npz")[0] == 0
+    assert cli("validate", tmp_path / "home" / "a room")[0] == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
+    assert (tmp_path / "home" / "tracks.npz").is_file()
+
+
 @pytest.mark.parametrize("verb", ["reconstruct", "stream"])
 def test_frames_that_may_be_in_another_order_are_warned_of(cli: Run, scene: Path, tmp_path: Path, verb: str) -> None:
     """``ffmpeg -i clip.mp4 rgb/%d.png`` writes 10 before 2 in the order of names."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from enum import Enum
@@ -113,6 +114,12 @@ def _tidy_parameter(parameter: Any) -> None:
         parameter.help = f"{(parameter.help or '').rstrip('.')}: {', '.join(names)}."
 
 
+def _from_home(word: str) -> str:
+    """Return a word with the home folder in the place of ``~``, which shells leave as it is in ``--out=~/run``."""
+    option, sign, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    return option + sign + os.path.expanduser(value) if value == "~" or value.startswith("~/") else word
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code."""
     debug = "--debug" in arguments
@@ -120,7 +127,7 @@ def run(arguments: list[str]) -> int:
         asked = next((word for word in arguments if not word.startswith("-")), None)
         command = typer.main.get_command(application(asked))
         _tidy_help(command)
-        command(args=[word for word in arguments if word != "--debug"], prog_name="uni4d-fg")
+        command(args=[_from_home(word) for word in arguments if word != "--debug"], prog_name="uni4d-fg")
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1 if stop.code else 0
     except (Exception, KeyboardInterrupt) as error:
