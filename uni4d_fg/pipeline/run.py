@@ -191,6 +191,9 @@ def reconstruct(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
+    if imu is not None:
+        check_goes_with_imu(config, len(windows_of(config, sequence.num_frames)))
+        imu.check_covers(sequence.timestamps)
     check_asked(sequence, config)
     if workers is not None and config.windows.frames is None:
         raise ConfigError("workers solve the windows of a long video: set windows.frames (`--window N`)")
@@ -216,8 +219,6 @@ def _reconstruct(
     run_stage = with_additions(recorder, sources)
     windows = windows_of(config, sequence.num_frames)
     if imu is not None:
-        check_goes_with_imu(config, len(windows))
-        imu.check_covers(sequence.timestamps)
         cues = metric_cues(cues) if cues else cues
     folder = RunFolder(run_dir)
     height, width = sequence.image_size
