@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.digest import frames_digest, update
 from uni4d_fg.frontend.sequence.frame_checks import checked_image, checked_mask, floating_depth
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
 from uni4d_fg.optim.threads import map_in_order, thread_count
@@ -21,7 +21,16 @@ ALGORITHM_VERSION = 3
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""
 
 
-def sequence_key(sequence: Sequence, should_stop: Callable[[], bool] | None = None) -> str:
+class SequenceDigest(NamedTuple):
+    """Hashes of a sequence."""
+
+    key: str
+    """Of all that it holds."""
+    images: bytes
+    """Of its images alone."""
+
+
+def sequence_digest(sequence: Sequence, should_stop: Callable[[], bool] | None = None) -> SequenceDigest:
     """Hash every image, depth map and mask, the calibration, poses and tracks; frames one at a time.
 
     Raises:
@@ -31,30 +40,28 @@ def sequence_key(sequence: Sequence, should_stop: Callable[[], bool] | None = No
 
     def hashed(named: tuple[str, FrameSource[Any]]) -> bytes:
         name, source = named
-        own = hashlib.blake2b(digest_size=16)
-        for frame in range(sequence.num_frames):
-            if should_stop is not None and should_stop():
-                raise Cancelled("stopped while reading the sequence")
-            array = source[frame]
+
+        def check(array: Any, frame: int) -> None:
             # Sources of the caller's own may hold anything; what comes after relies on shapes and types.
             _CHECKS[name](array, sequence.image_size, f"sequence {sequence.name}: {name} of frame {frame}")
-            _update(own, array)
-        return own.digest()
+
+        return frames_digest(source, should_stop, check)
 
     # Side by side, but each in order and by one thread: a video is decoded forwards.
     sources = [("image", sequence.images), ("depth", sequence.depths), ("mask", sequence.masks)]
-    digest = hashlib.blake2b(b"".join(map_in_order(hashed, sources, thread_count())), digest_size=16)
-    _update(digest, sequence.intrinsics)
+    found = map_in_order(hashed, sources, thread_count())
+    digest = hashlib.blake2b(b"".join(found), digest_size=16)
+    update(digest, sequence.intrinsics)
     if not sequence.lens.is_pinhole:
         digest.update(sequence.lens.model.encode())
-        _update(digest, sequence.lens.padded)
-    _update(digest, sequence.timestamps)
+        update(digest, sequence.lens.padded)
+    update(digest, sequence.timestamps)
     if sequence.initial_world_T_cam is not None:
-        _update(digest, sequence.initial_world_T_cam)
+        update(digest, sequence.initial_world_T_cam)
     if sequence.tracks is not None:
         for values in (sequence.tracks.uv, sequence.tracks.visible, sequence.tracks.query_frame):
-            _update(digest, values)
-    return digest.hexdigest()
+            update(digest, values)
+    return SequenceDigest(digest.hexdigest(), found[0])
 
 
 def stage_key(previous: str, *sections: Any) -> str:
@@ -64,8 +71,3 @@ def stage_key(previous: str, *sections: Any) -> str:
         data = section.model_dump(mode="json") if hasattr(section, "model_dump") else section
         digest.update(json.dumps(data, sort_keys=True).encode())
     return digest.hexdigest()
-
-
-def _update(digest: hashlib.blake2b, array: np.ndarray) -> None:
-    digest.update(f"{array.shape} {array.dtype}".encode())
-    digest.update(np.ascontiguousarray(array).data)

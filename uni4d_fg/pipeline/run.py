@@ -41,7 +41,7 @@ from uni4d_fg.optim.threads import one_blas_thread, thread_limit
 from uni4d_fg.pipeline.asked import check_asked
 from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
-from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
+from uni4d_fg.pipeline.fingerprint import sequence_digest, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import GraphValues, kinds_of, remove_graphs
 from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
@@ -253,12 +253,12 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
         Thread(target=pictures.load).start()
     remove_leftovers(folder)
     atomic_write_text(folder.config, dump_config(config))
-    key = sequence_key(sequence, run.should_stop)
+    key, images = sequence_digest(sequence, run.should_stop)
     sequence = run.sequence = without_bars(sequence, look=config.input.black_bars == "auto")
     if config.input.repair_masks:
         key = _repair_masks(run, key)
         sequence = run.sequence
-    key, labelled = _labels(run, key)
+    key, labelled = _labels(run, key, images)
     key = stage_key(
         key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
     )
@@ -400,8 +400,11 @@ def _repair_masks(run: _Run, key: str) -> str:
     return stage_key(key, repaired.fingerprint())
 
 
-def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
-    """Track and label; the labelled tracks are stored in ``labels.npz``, their key beside the stages."""
+def _labels(run: _Run, key: str, images: bytes) -> tuple[str, LabelledTracks]:
+    """Track and label; the labelled tracks are stored in ``labels.npz``, their key beside the stages.
+
+    ``images`` is the hash of the images.
+    """
     sequence, config = run.sequence, run.config
     key = stage_key(key, config.tracking if sequence.tracks is None else None, config.labels, config.input)
 
@@ -411,7 +414,7 @@ def _labels(run: _Run, key: str) -> tuple[str, LabelledTracks]:
         cache = run.store.folder
         tracks = load_or_track(
             sequence, config.tracking, cache, run.track_progress, run.should_stop,
-            lambda path, made: run.written.put(partial(save_tracks, path, made)),
+            lambda path, made: run.written.put(partial(save_tracks, path, made)), images,
         )  # fmt: skip
         labelled = label_tracks(tracks, sequence, config.labels, config.input)
         run.written.put(partial(save_labels, run.folder.labels, labelled))

@@ -8,6 +8,7 @@ import pytest
 
 from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.errors import Cancelled, InputError, OutputError
+from uni4d_fg.frontend.sequence.digest import frames_digest
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks import cache
@@ -64,7 +65,9 @@ def test_second_call_reads_the_cache(sequence: Sequence, tmp_path: Path, runs: l
     assert len(runs) == 1
     assert first.num_tracks > 0
     assert_same(first, again)
-    assert [p.name for p in (tmp_path / "cache").iterdir()] == [f"tracks-{cache_key(sequence.images, CONFIG)}.npz"]
+    assert [p.name for p in (tmp_path / "cache").iterdir()] == [
+        f"tracks-{cache_key(frames_digest(sequence.images), CONFIG)}.npz"
+    ]
 
 
 def test_without_a_cache_nothing_is_written(sequence: Sequence, tmp_path: Path, runs: list[int]) -> None:
@@ -84,12 +87,12 @@ def test_own_tracks_come_first(sequence: Sequence, tmp_path: Path, runs: list[in
 
 
 def test_key_depends_on_every_pixel_and_every_setting(sequence: Sequence) -> None:
-    key = cache_key(sequence.images, CONFIG)
-    assert cache_key(sequence.images, CONFIG) == key
+    key = cache_key(frames_digest(sequence.images), CONFIG)
+    assert cache_key(frames_digest(sequence.images), CONFIG) == key
     for frame in range(4):
         images = np.stack(list(sequence.images))
         images[frame, -1, -1, 2] ^= 1
-        assert cache_key(ArrayFrames(images), CONFIG) != key
+        assert cache_key(frames_digest(ArrayFrames(images)), CONFIG) != key
     changed = {
         "grid_columns": 7,
         "window_px": 23,
@@ -98,10 +101,10 @@ def test_key_depends_on_every_pixel_and_every_setting(sequence: Sequence) -> Non
         "min_observations": 2,
     }
     for name, value in changed.items():
-        assert cache_key(sequence.images, CONFIG.model_copy(update={name: value})) != key
+        assert cache_key(frames_digest(sequence.images), CONFIG.model_copy(update={name: value})) != key
     images = np.stack(list(sequence.images))
-    assert cache_key(ArrayFrames(images[:3]), CONFIG) != key
-    assert cache_key(ArrayFrames(images.reshape(4, 64, 48, 3)), CONFIG) != key
+    assert cache_key(frames_digest(ArrayFrames(images[:3])), CONFIG) != key
+    assert cache_key(frames_digest(ArrayFrames(images.reshape(4, 64, 48, 3))), CONFIG) != key
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "garbage", "other length", "missing array"])

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.arrays import ImageArray
 from uni4d_fg.config.cues import TrackingConfig
-from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.bars import CroppedFrames
-from uni4d_fg.frontend.sequence.model import Content, FrameSource, Sequence, Video
+from uni4d_fg.frontend.sequence.digest import frames_digest
+from uni4d_fg.frontend.sequence.model import Content, Sequence, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.first_views import refines
 from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
@@ -23,20 +23,10 @@ TRACKER_VERSION = 4
 """Part of the cache key; raised whenever the tracker gives other tracks for the same input."""
 
 
-def cache_key(images: FrameSource[ImageArray], config: TrackingConfig, should_stop: ShouldStop | None = None) -> str:
-    """Return a hexadecimal key that changes with the tracker, its configuration or any pixel of any image.
-
-    Raises:
-        Cancelled: If ``should_stop`` said so.
-    """
-    digest = hashlib.blake2b(digest_size=16)
-    digest.update(f"{TRACKER_VERSION} {refines(config)} {len(images)} {config.model_dump_json()}".encode())
-    for image in images:
-        if should_stop is not None and should_stop():
-            raise Cancelled("tracking stopped while looking for remembered tracks")
-        digest.update(f"{image.shape} {image.dtype}".encode())
-        digest.update(np.ascontiguousarray(image).data)
-    return digest.hexdigest()
+def cache_key(images: bytes, config: TrackingConfig) -> str:
+    """Return a hexadecimal key that changes with the tracker, its configuration or the hash of the images."""
+    settings = f"{TRACKER_VERSION} {refines(config)} {config.model_dump_json()}".encode()
+    return hashlib.blake2b(settings + images, digest_size=16).hexdigest()
 
 
 def load_or_track(
@@ -46,6 +36,7 @@ def load_or_track(
     progress: Progress | None = None,
     should_stop: ShouldStop | None = None,
     save: Callable[[Path, Tracks], None] = save_tracks,
+    digest: bytes | None = None,
 ) -> Tracks:
     """Return the tracks of a sequence, tracking only if there is no other way.
 
@@ -56,6 +47,7 @@ def load_or_track(
         progress: Told the tracking steps done and to do.
         should_stop: Asked before every step.
         save: Writes new tracks.
+        digest: Hash of the images, by :func:`~uni4d_fg.frontend.sequence.digest.frames_digest`; made here when None.
 
     Raises:
         InputError: If the images cannot be tracked, or the sequence's tracks have another length than it.
@@ -77,7 +69,9 @@ def load_or_track(
         return replace(tracks, uv=tracks.uv + np.array([content.left, content.top], np.float32))
     if cache_dir is None:
         return track_grid(sequence.images, config, progress, should_stop)
-    path = cache_dir / f"tracks-{cache_key(sequence.images, config, should_stop)}.npz"
+    if digest is None:
+        digest = frames_digest(sequence.images, should_stop)
+    path = cache_dir / f"tracks-{cache_key(digest, config)}.npz"
     remembered = _remembered(path, sequence.num_frames)
     if remembered is not None:
         return remembered

@@ -25,7 +25,7 @@ from uni4d_fg.pipeline.compare.solvers import ADAM, LM, SolverVariant
 from uni4d_fg.pipeline.compare.stored_results import ResultStore
 from uni4d_fg.pipeline.compare.task import Task, TaskRecorder
 from uni4d_fg.pipeline.compare.whole_run import WholeRun, whole_run
-from uni4d_fg.pipeline.fingerprint import sequence_key, stage_key
+from uni4d_fg.pipeline.fingerprint import sequence_digest, stage_key
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageStore
 from uni4d_fg.progress import Reporter, SilentReporter
@@ -101,7 +101,7 @@ def compare_sequence(
         tracks = track_grid(sequence.images, config.tracking, lambda done, _: reporter.advance(done), should_stop)
         reporter.end()
         sequence = replace(sequence, tracks=tracks)
-    parts, key = ResultStore(folder / "parts", resume), sequence_key(sequence, should_stop)
+    parts, key = ResultStore(folder / "parts", resume), sequence_digest(sequence, should_stop).key
     runs: dict[str, WholeRun] = {}
     for solver in solvers:
         own = solver.config(config)
