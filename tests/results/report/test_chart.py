@@ -4,7 +4,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from uni4d_fg.results.report.chart import Line, line_chart, nice_ticks
@@ -28,6 +28,7 @@ def test_ticks_are_round_and_within_the_range(low: float, length: float, whole: 
         assert len(ticks) >= 2
 
 
+@example([5e-324], False)
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=40), st.booleans())
 def test_any_values_give_a_well_formed_chart_inside_its_frame(values: list[float], log: bool) -> None:
     chart = line_chart("c", "A <chart>", [Line("a & b", range(len(values)), values)], x_label="x", y_label="y", log=log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -111,7 +112,7 @@ def legend(names: Sequence[str]) -> Markup:
 
 def nice_ticks(low: float, high: float, *, count: int = 5, whole: bool = False) -> list[float]:
     """Return about ``count`` round numbers within a range; whole ones if asked for; none where digits do not reach."""
-    if not 1e-12 * max(abs(low), abs(high)) < high - low < math.inf:
+    if not max(1e-12 * max(abs(low), abs(high)), sys.float_info.min) < high - low < math.inf:
         return []
     step = 10.0 ** math.floor(math.log10((high - low) / count))
     for factor in (1, 2, 5, 10):
