@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from uni4d_fg.cli import main
 from uni4d_fg.cli.runs import stored_input
-from uni4d_fg.cues.gather import NOT_METRIC
+from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_GIVEN
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.read import read_sequence
 from uni4d_fg.frontend.sequence.write import write_native
@@ -148,6 +148,19 @@ def test_the_cues_of_a_run_are_opened_again(cli: Run, frames_only: Path, clip: P
     kept = {p: p.stat().st_mtime_ns for p in before if p.exists() and "initial" not in p.name}
     assert kept == {p: t for p, t in before.items() if "initial" not in p.name}
     assert cli("reconstruct", clip, "--out", frames_only, *QUICK)[0] == 6
+
+
+def test_cues_up_to_scale_are_up_to_scale_in_another_run(cli: Run, clip: Path, tmp_path: Path) -> None:
+    words = ["cues", clip, "--out", tmp_path / "made", "--set", "tracking.grid_columns=24", "--quiet"]
+    code, _, err = cli(*words)
+    assert code == 0
+    assert "not metric" in err
+    code, out, _ = cli("reconstruct", tmp_path / "made", "--out", tmp_path / "run", *QUICK)
+    assert code == 0
+    assert "cues: depth given, in a unit of its own" in out
+    summary = summary_of(tmp_path / "run")
+    assert summary["cues"]["metric"] is False
+    assert summary["warnings"].count(NOT_METRIC_GIVEN) == 1
 
 
 def test_cues_writes_a_sequence_that_reads_back(cli: Run, clip: Path, card: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import pickle
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from stream_samples import stream as stream_of
 from typer.testing import CliRunner
 
 from uni4d_fg.cli.main import application
+from uni4d_fg.cues.gather import NOT_METRIC_GIVEN
 from uni4d_fg.errors import Cancelled, InputError, OutputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.write import write_native
@@ -47,6 +49,14 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert summary.num_frames == FRAMES
     assert sum(summary.counts.values()) == FRAMES
     return folder
+
+
+def test_lengths_are_in_the_unit_of_the_depth(tmp_path: Path) -> None:
+    for metric in (True, False):
+        given = replace(stream(8), depth_is_metric=metric)
+        found = stream_sequence(given, tmp_path / str(metric), CONFIG).to_dict()
+        assert found["cues"] == {"metric": metric}
+        assert (NOT_METRIC_GIVEN in found["warnings"]) is not metric
 
 
 def assert_same(folder: Path, expected: Path) -> None:

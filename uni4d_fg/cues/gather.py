@@ -35,6 +35,9 @@ NOT_METRIC = (
     "depth is not metric: no depth was given, so it was found from the motion of the camera, which leaves the scale "
     "unknown; all lengths are in a unit of its own"
 )
+NOT_METRIC_GIVEN = (
+    "depth is not metric, as a note beside it says (depth_cue.json); all lengths are in a unit of its own"
+)
 NOT_METRIC_RELATIVE = (
     "depth is not metric: the depth network gives relative depth, which was scaled to the motion of the camera; all "
     "lengths are in a unit of its own"
@@ -93,6 +96,9 @@ class _Gathering:
         self.video, self.plan, self.folder, self.config = video, plan, folder, config
         self.reporter, self.should_stop, self.track_cache = reporter, should_stop, track_cache
         self.report = CueReport()
+        if plan.depth == "given" and not video.depth_is_metric:
+            self.report.metric = False
+            self.report.warnings.append(NOT_METRIC_GIVEN)
         self.tracks = video.tracks if plan.tracks == "given" else None
         self.track_file: Path | None = None
         self.intrinsics = video.intrinsics
@@ -131,7 +137,7 @@ class _Gathering:
         sequence = as_sequence(
             replace(
                 self.video, depths=depths, masks=masks, intrinsics=self._start_intrinsics(), tracks=self.tracks,
-                initial_world_T_cam=self.world_T_cam, content=None,
+                initial_world_T_cam=self.world_T_cam, content=None, depth_is_metric=report.metric,
             )
         )  # fmt: skip
         if not plan.is_given:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_RELATIVE
+from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.factors.variable_types import CUE_SCALE, GRAVITY, IMU_BIAS
 from uni4d_fg.optim.added_factors import AddingRunner
@@ -34,7 +34,8 @@ def check_goes_with_imu(config: Config, num_windows: int) -> None:
 
 def metric_cues(cues: Mapping[str, Any]) -> dict[str, Any]:
     """Return what is said of the cues of a video whose scale an IMU finds."""
-    warnings = [text for text in cues.get("warnings", []) if text not in (NOT_METRIC, NOT_METRIC_RELATIVE)]
+    said = (NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE)
+    warnings = [text for text in cues.get("warnings", []) if text not in said]
     return {**cues, "warnings": warnings, "metric": True}
 
 

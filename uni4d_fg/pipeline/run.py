@@ -19,7 +19,9 @@ from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.counted import counted
+from uni4d_fg.cues.gather import NOT_METRIC_GIVEN
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
+from uni4d_fg.cues.plan import CueReport
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
@@ -218,6 +220,9 @@ def _reconstruct(
     sources = (*additions, *measured.sources)
     run_stage = with_additions(recorder, sources)
     windows = windows_of(config, sequence.num_frames)
+    if not sequence.depth_is_metric and not cues:
+        given = {"depth": "given, in a unit of its own"}
+        cues = CueReport(given, warnings=[NOT_METRIC_GIVEN], metric=False).to_dict()
     if imu is not None:
         cues = metric_cues(cues) if cues else cues
     folder = RunFolder(run_dir)

@@ -12,6 +12,7 @@ import numpy as np
 
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.gather import NOT_METRIC_GIVEN
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.files import atomic_write_json, atomic_write_text, remove_file
 from uni4d_fg.frontend.sequence.model import Sequence
@@ -54,12 +55,20 @@ class StreamSummary:
     """Frames of the result that were bridged, those of earlier processes too."""
     facts: list[str] = field(default_factory=list)
     """Loops that were closed, and what measurements there were."""
+    metric: bool = True
+    """Whether lengths are in meters."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         return {
             "sequence": {"name": self.name, "num_frames": self.num_frames},
-            "stages": {"stream": {**{k: v for k, v in self.__dict__.items() if k != "doubts"}, "name": "stream"}},
+            "cues": {"metric": self.metric},
+            "stages": {
+                "stream": {
+                    **{k: v for k, v in self.__dict__.items() if k not in ("doubts", "metric")},
+                    "name": "stream",
+                }
+            },
             "warnings": self.warnings(),
             "versions": versions(),
         }
@@ -134,7 +143,13 @@ def stream_sequence(
         summary = replace(
             summary,
             facts=[*summary.facts, *measured.facts],
-            doubts=[*order_warnings(sequence.frame_names), *summary.doubts, *measured.warnings],
+            doubts=[
+                *order_warnings(sequence.frame_names),
+                *([] if sequence.depth_is_metric else [NOT_METRIC_GIVEN]),
+                *summary.doubts,
+                *measured.warnings,
+            ],
+            metric=sequence.depth_is_metric,
         )
         atomic_write_json(RunFolder(run_dir).summary, summary.to_dict())
         return summary

@@ -413,3 +413,26 @@ def test_a_true_pose_may_be_unknown_and_a_pose_to_start_from_not(tmp_path: Path,
     np.save(root / "world_T_cam_init.npy", poses)
     with pytest.raises(InputError, match=r"world_T_cam_init\.npy: has NaN or infinite entries in frame\(s\) 1"):
         read_native(root)
+
+
+def test_depth_in_a_unit_of_its_own_says_so_in_the_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "sequence"
+    write_native(dataclasses.replace(sample_sequence(), depth_is_metric=False), folder)
+    note = folder / "depth_cue.json"
+    assert note.read_text() == '{"metric": false}\n'
+    assert not read_native(folder).depth_is_metric
+    note.write_text('{"metric": true}')
+    assert read_native(folder).depth_is_metric
+    for text in ("[]", "{}", '{"metric": 1}'):
+        note.write_text(text)
+        with pytest.raises(InputError, match=r"depth_cue\.json: does not say whether depth is in meters"):
+            read_native(folder)
+    note.unlink()
+    assert read_native(folder).depth_is_metric
+
+
+def test_the_note_is_of_the_usual_depth_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "sequence"
+    write_native(dataclasses.replace(sample_sequence(), depth_is_metric=False), folder)
+    shutil.copytree(folder / "depth_cue", folder / "other")
+    assert read_native(folder, depth="other").depth_is_metric

@@ -19,6 +19,7 @@ from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.selection import MIN_FRAMES
 from uni4d_fg.frontend.sequence.track_files import RawTracks, load_native_tracks, load_uni4d_tracks
 from uni4d_fg.frontend.sequence.video import VideoFrames
+from uni4d_fg.reading import read_json
 
 
 def open_images(path: Path, stop: int | None = None) -> ImageFolder | VideoFrames:
@@ -117,6 +118,20 @@ def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> Gr
     return GroundTruth(intrinsics=intrinsics, track_points=points, rigid_instance=instance, world_T_object=poses)
 
 
+def load_depth_note(path: Path) -> bool:
+    """Return whether depth is in meters, as a file beside it says.
+
+    Raises:
+        InputError: If it does not say.
+    """
+    note = read_json(path)
+    if not isinstance(note, dict) or not isinstance(note.get("metric"), bool):
+        raise SequenceProblem(
+            path, "does not say whether depth is in meters", 'write {"metric": false} or {"metric": true}, or remove it'
+        )
+    return bool(note["metric"])
+
+
 def frame_names(images: ImageFolder | VideoFrames) -> tuple[str, ...]:
     """Return the stems of the image files, or five-digit frame numbers for a video."""
     if isinstance(images, VideoFrames):
@@ -168,6 +183,7 @@ def as_sequence(video: Video) -> Sequence:
         root=video.root,
         frame_names=video.frame_names,
         initial_world_T_cam=video.initial_world_T_cam,
+        depth_is_metric=video.depth_is_metric,
         tracks=video.tracks,
         lens=video.lens,
         ground_truth=video.ground_truth,
@@ -218,6 +234,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
             default_timestamps(images) if files.timestamps is None else load_timestamps(files.timestamps, num_frames)
         ),
         depths=depths,
+        depth_is_metric=files.depth_note is None or load_depth_note(files.depth_note),
         masks=masks,
         intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
         tracks=tracks,

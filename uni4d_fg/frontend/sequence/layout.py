@@ -47,6 +47,8 @@ class SequenceFiles:
     """Folder of images, or a video file."""
     depth: Path | None = None
     """Folder of depth maps, or one ``.npy`` file."""
+    depth_note: Path | None = None
+    """Says whether depth is in meters, which it is where this is absent."""
     masks: Path | None = None
     intrinsics: Path | None = None
     tracks: Path | None = None

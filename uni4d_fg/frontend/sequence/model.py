@@ -94,6 +94,8 @@ class Video:
     """(T,) seconds, strictly increasing; frame index when unknown."""
     depths: FrameSource[Float32Array] | None = None
     """T maps (H, W), float32 meters, NaN where missing."""
+    depth_is_metric: bool = True
+    """Whether depth is in meters; else it is in a unit of its own."""
     masks: FrameSource[Int32Array] | None = None
     """T label maps (H, W), int32."""
     intrinsics: FloatArray | None = None
@@ -144,6 +146,8 @@ class Sequence:
     """T stems of the image files ("00000", ...), used to name per-frame outputs."""
     initial_world_T_cam: FloatArray | None = None
     """(T, 4, 4) poses to start from or to keep, as the config says."""
+    depth_is_metric: bool = True
+    """Whether depth is in meters; else it is in a unit of its own."""
     tracks: Tracks | None = None
     """Long 2D point tracks, when the sequence brings them."""
     lens: Lens = PINHOLE

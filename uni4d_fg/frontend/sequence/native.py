@@ -18,6 +18,8 @@ from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
 from uni4d_fg.reading import is_present
 
 DEFAULT_DEPTH = "depth_cue"
+DEPTH_NOTE = "depth_cue.json"
+"""Beside that depth: ``{"metric": false}`` where it is in a unit of its own."""
 
 
 def _depth_candidates(root: Path, depth: str | None) -> list[Path]:
@@ -74,6 +76,7 @@ def find_native_files(root: Path, depth: str | None = None) -> SequenceFiles:
         layout="native",
         images=images,
         depth=candidates[0] if len(candidates) == 1 else None,
+        depth_note=existing(root / DEPTH_NOTE) if depth in (None, DEFAULT_DEPTH) and candidates else None,
         masks=existing(root / "masks"),
         intrinsics=existing(root / "K.npy"),
         tracks=existing(root / "tracks.npz"),

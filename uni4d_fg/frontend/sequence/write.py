@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from uni4d_fg.files import atomic_folder, save_npy, save_npz
 from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.frontend.sequence.decode import clean_depth
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
+from uni4d_fg.frontend.sequence.native import DEFAULT_DEPTH, DEPTH_NOTE
 from uni4d_fg.frontend.track_model import Tracks
 
 MAX_PNG_DEPTH = 65.0
@@ -79,7 +81,9 @@ def write_cues(sequence: Sequence, root: Path) -> None:
 
 
 def _write_cues(sequence: Sequence, folder: Path, names: tuple[str, ...]) -> None:
-    _write_depth(sequence.depths, folder / "depth_cue", names)
+    _write_depth(sequence.depths, folder / DEFAULT_DEPTH, names)
+    if not sequence.depth_is_metric:
+        (folder / DEPTH_NOTE).write_text(json.dumps({"metric": False}) + "\n", encoding="utf-8")
     _write_masks(sequence.masks, folder / "masks", names, always_rgb=False)
     save_npy(folder / "K.npy", intrinsics_matrix(sequence.intrinsics))
     if sequence.tracks is not None:
