@@ -47,8 +47,9 @@ void bind_patch_registration(nb::module_& module) {
   module.def("register_patches", &register_all, nb::arg("templates"), nb::arg("rows"), nb::arg("image"),
              nb::arg("warp"), nb::kw_only(), nb::arg("weight"), nb::arg("stiffness"), nb::arg("max_iterations"),
              nb::arg("convergence_px"), nb::arg("threads") = 0,
-             "Find the rows (N,) of templates (M, P + 2, P + 2) in an image (H, W) of bytes under affine warps, from warp (N, 6): "
-             "u, v and the affine part by rows. Returns the warps and the correlations (N,), -1 where there is none.");
+             "Find the rows (N,) of templates (M, P + 2, P + 2) in an image (H, W) of bytes under affine warps, from warp "
+             "(N, 6): u, v and the affine part by rows. Returns the warps and the correlations (N,), -1 where there is "
+             "none.");
 }
 
 }  // namespace uni4d_fg

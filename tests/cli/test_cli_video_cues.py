@@ -139,6 +139,7 @@ def test_the_cues_of_a_run_are_opened_again(cli: Run, frames_only: Path, clip: P
     opened = stored_input(frames_only).read()
     assert isinstance(opened, Sequence)
     assert opened.tracks is not None
+    assert not opened.depth_is_metric
     assert np.isfinite(opened.depths[5]).all()
     before = {p: p.stat().st_mtime_ns for p in (frames_only / "cues").rglob("*.np[yz]") if p.name != "tracks.npz"}
     words = ["reconstruct", clip, "--out", frames_only, "--set", "tracking.grid_columns=24", *QUICK, "--json"]

@@ -33,7 +33,7 @@ def main() -> None:
     try:
         run()
     finally:
-        # The memory goes back with the process: to search it for cycles once more takes a quarter of a second.
+        # The memory goes back with the process: to search it for cycles twice more takes half a second.
         gc.freeze()
 
 

@@ -22,6 +22,7 @@ from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.cues.packed_maps import load_map, save_map
 from uni4d_fg.errors import InputError, OutputError
 from uni4d_fg.files import atomic_path, atomic_write_text, load_npy, load_npz, save_npy, save_npz
+from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import FileFrames
 
 CACHE_VERSION = 2
@@ -30,8 +31,8 @@ CACHE_VERSION = 2
 
 def image_key(image: ImageArray) -> str:
     """Return a hexadecimal key of the pixels of an image."""
-    digest = hashlib.blake2b(f"{image.shape} {image.dtype}".encode(), digest_size=16)
-    digest.update(np.ascontiguousarray(image).data)
+    digest = hashlib.blake2b(digest_size=16)
+    add_array(digest, image)
     return digest.hexdigest()
 
 

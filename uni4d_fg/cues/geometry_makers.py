@@ -20,6 +20,7 @@ from uni4d_fg.cues.interpolated_depth import GridDepths, InterpolatedDepths
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import MaskFolder
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
@@ -171,8 +172,7 @@ def _tracks_key(tracks: Tracks) -> str:
 def _digest(*arrays: np.ndarray) -> str:
     digest = hashlib.blake2b(digest_size=16)
     for array in arrays:
-        digest.update(f"{array.shape} {array.dtype}".encode())
-        digest.update(np.ascontiguousarray(array).data)
+        add_array(digest, array)
     return digest.hexdigest()
 
 

@@ -113,7 +113,7 @@ def load_cues(video: Video, folder: Path) -> tuple[Sequence, CueReport]:
             f"{path}: cues of {stored.num_frames} frames of {list(stored.image_size)} px, but {video.name} has "
             f"{video.num_frames} of {list(video.image_size)}; was the video replaced? Make the cues again"
         )
-    changes: dict[str, Any] = {"intrinsics": np.array(stored.intrinsics)}
+    changes: dict[str, Any] = {"intrinsics": np.array(stored.intrinsics), "depth_is_metric": stored.report.metric}
     if stored.depth is not None:
         changes["depths"] = FloatMaps(_paths(stored.depth, folder, video), video.image_size)
     if stored.masks is not None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uni4d_fg.frontend.sequence.digest import frames_digest, update
+from uni4d_fg.frontend.sequence.digest import add_array, frames_digest
 from uni4d_fg.frontend.sequence.frame_checks import checked_image, checked_mask, floating_depth
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
 from uni4d_fg.optim.threads import map_in_order, thread_count
@@ -51,16 +51,16 @@ def sequence_digest(sequence: Sequence, should_stop: Callable[[], bool] | None =
     sources = [("image", sequence.images), ("depth", sequence.depths), ("mask", sequence.masks)]
     found = map_in_order(hashed, sources, thread_count())
     digest = hashlib.blake2b(b"".join(found), digest_size=16)
-    update(digest, sequence.intrinsics)
+    add_array(digest, sequence.intrinsics)
     if not sequence.lens.is_pinhole:
         digest.update(sequence.lens.model.encode())
-        update(digest, sequence.lens.padded)
-    update(digest, sequence.timestamps)
+        add_array(digest, sequence.lens.padded)
+    add_array(digest, sequence.timestamps)
     if sequence.initial_world_T_cam is not None:
-        update(digest, sequence.initial_world_T_cam)
+        add_array(digest, sequence.initial_world_T_cam)
     if sequence.tracks is not None:
         for values in (sequence.tracks.uv, sequence.tracks.visible, sequence.tracks.query_frame):
-            update(digest, values)
+            add_array(digest, values)
     return SequenceDigest(digest.hexdigest(), found[0])
 
 

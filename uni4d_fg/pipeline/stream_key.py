@@ -13,6 +13,7 @@ import numpy as np
 
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.optim.added_factors import FactorSource, fingerprints
 from uni4d_fg.pipeline.fingerprint import ALGORITHM_VERSION
@@ -42,7 +43,7 @@ class StreamKey:
         tracks = sequence.tracks
         given = () if tracks is None else (tracks.uv, tracks.visible, tracks.query_frame)
         for array in (sequence.intrinsics, sequence.timestamps, *given):
-            _add(digest, array)
+            add_array(digest, array)
         self.selection = digest.hexdigest()
         self.consumed = ""
 
@@ -50,7 +51,7 @@ class StreamKey:
         """Add the next frame."""
         digest = hashlib.blake2b(self.consumed.encode(), digest_size=16)
         for array in (image, depth, mask):
-            _add(digest, array)
+            add_array(digest, array)
         self.consumed = digest.hexdigest()
 
     def check(self, selection: str, consumed: str, frames: int, should_stop: Callable[[], bool] | None) -> None:
@@ -78,8 +79,3 @@ class StreamKey:
             self.take(self._sequence.images[frame], self._sequence.depths[frame], self._sequence.masks[frame])
         if consumed != self.consumed:
             raise InputError(f"the checkpoint was written from other images, depth or masks; {remedy}")
-
-
-def _add(digest: hashlib.blake2b, array: np.ndarray) -> None:
-    digest.update(f"{array.shape} {array.dtype}".encode())
-    digest.update(np.ascontiguousarray(array).data)

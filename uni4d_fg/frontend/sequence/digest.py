@@ -1,4 +1,4 @@
-"""A hash of all frames of one kind."""
+"""Hashes of arrays, and of all frames of one kind."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def frames_digest(
         frame = frames[number]
         if check is not None:
             check(frame, number)
-        update(digest, frame)
+        add_array(digest, frame)
     return digest.digest()
 
 
-def update(digest: hashlib.blake2b, array: np.ndarray) -> None:
+def add_array(digest: hashlib.blake2b, array: np.ndarray) -> None:
     """Add an array, with its shape and type, to a hash."""
     digest.update(f"{array.shape} {array.dtype}".encode())
     digest.update(np.ascontiguousarray(array).data)

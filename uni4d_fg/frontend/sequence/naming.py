@@ -17,12 +17,11 @@ _REMEDY = "pad the numbers with zeros if the video runs in another order"
 
 def order_warnings(stems: Sequence[str]) -> list[str]:
     """Return a sentence if the numbers that end file names do not increase in the order in which frames are taken."""
-    doubt = _unordered(stems)
+    doubt = _unordered(stems, _numbers(stems))
     return [] if doubt is None else [f"{doubt}; {_REMEDY}"]
 
 
-def _unordered(stems: Sequence[str]) -> str | None:
-    numbers = _numbers(stems)
+def _unordered(stems: Sequence[str], numbers: list[int] | None) -> str | None:
     steps = np.diff(numbers) if numbers is not None else np.empty(0)
     if not (steps <= 0).any():
         return None
@@ -37,11 +36,11 @@ def _numbers(stems: Sequence[str]) -> list[int] | None:
 
 def check_numbering(stems: list[str], findings: Findings) -> None:
     """Warn of numbers that do not increase in name order, and of missing frames."""
-    doubt = _unordered(stems)
+    numbers = _numbers(stems)
+    doubt = _unordered(stems, numbers)
     if doubt is not None:
         findings.add("warning", "images", doubt, _REMEDY)
         return
-    numbers = _numbers(stems)
     if numbers is None or len(numbers) < 2:
         return
     steps = np.diff(numbers)
