@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from uni4d_fg.cli import main
 from uni4d_fg.cli.runs import stored_input
-from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_GIVEN
+from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.read import read_sequence
 from uni4d_fg.frontend.sequence.write import write_native

@@ -18,10 +18,11 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.cues import cache as cue_cache
 from uni4d_fg.cues.cache import FrameCache, Rate, image_key, write_labels
 from uni4d_fg.cues.depth_network import DepthNetwork
-from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_RELATIVE, gather_cues, static_tracks
+from uni4d_fg.cues.gather import gather_cues, static_tracks
 from uni4d_fg.cues.manifest import has_manifest, load_cues
 from uni4d_fg.cues.packed_maps import RELATIVE_ERROR, rounded
 from uni4d_fg.cues.plan import CueFiles, CuePlan, plan_cues
+from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_RELATIVE
 from uni4d_fg.errors import Cancelled, ConfigError, InputError, OutputError
 from uni4d_fg.files import save_npy, save_npz
 from uni4d_fg.frontend.sequence.decode import read_mask

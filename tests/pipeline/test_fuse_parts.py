@@ -20,7 +20,7 @@ from uni4d_fg.frontend.sequence.video import VideoFrames
 from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import run_stage
-from uni4d_fg.pipeline import dense_maps, fuse, fuse_parts, reconstruct, run
+from uni4d_fg.pipeline import control, dense_maps, fuse, fuse_parts, reconstruct, run
 from uni4d_fg.pipeline.dense_maps import SomeControlPoints
 from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.results.fusion.static_depth import HeldOut
@@ -45,7 +45,7 @@ def test_parts_have_the_bytes_of_the_whole(
     if matched and find_extension()[0] is None:
         pytest.skip("needs the C++ extension")
     sequence = make_scene(TINY, num_frames=30)
-    monkeypatch.setattr(fuse, "contradicting_frames", lambda control, config: broken)
+    monkeypatch.setattr(control, "contradicting_frames", lambda control, config: broken)
     if matched:
         monkeypatch.setattr(dense_maps, "held_out_errors", lambda *_: HeldOut(0.01, 0.5, True))
     monkeypatch.setattr(fuse_parts, "_LEAST_FRAMES", 7)
@@ -69,7 +69,7 @@ def test_parts_have_the_bytes_of_the_whole(
 
 def with_workers(workers: Any, *args: Any) -> dict[str, Any]:
     """Fuse on these workers."""
-    return fuse.fuse_depth(*args[:-1], workers)
+    return fuse.fuse_depth(*args[:-2], workers, args[-1])
 
 
 def test_parts_are_as_many_as_suit_the_workers() -> None:

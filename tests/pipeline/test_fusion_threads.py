@@ -10,14 +10,14 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from uni4d_fg.factors.state import State
 from uni4d_fg.optim.stage import Stage
-from uni4d_fg.pipeline import fuse, reconstruct
+from uni4d_fg.pipeline import control, fuse, reconstruct
 from uni4d_fg.results.run_folder import RunFolder
 
 
 @pytest.mark.parametrize("broken", [[], [5]])
 def test_threads_change_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: list[int]) -> None:
     sequence = make_scene(TINY, num_frames=9)
-    monkeypatch.setattr(fuse, "contradicting_frames", lambda control, config: broken)
+    monkeypatch.setattr(control, "contradicting_frames", lambda control, config: broken)
     stored = []
     for threads in (1, 4):
         monkeypatch.setattr(fuse, "thread_count", lambda count=threads: count)

@@ -18,7 +18,7 @@ from stream_samples import stream as stream_of
 from typer.testing import CliRunner
 
 from uni4d_fg.cli.main import application
-from uni4d_fg.cues.gather import NOT_METRIC_GIVEN
+from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
 from uni4d_fg.errors import Cancelled, InputError, OutputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.write import write_native

@@ -19,6 +19,7 @@ from uni4d_fg.cues.intrinsics import shared_intrinsics
 from uni4d_fg.cues.manifest import save_manifest
 from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_masks, network_tracks
 from uni4d_fg.cues.plan import CuePlan, CueReport
+from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.cues.start_doubts import doubts_of_masks
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
@@ -30,18 +31,6 @@ from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.optim.threads import on_one_blas_thread
 from uni4d_fg.progress import Reporter, SilentReporter
-
-NOT_METRIC = (
-    "depth is not metric: no depth was given, so it was found from the motion of the camera, which leaves the scale "
-    "unknown; all lengths are in a unit of its own"
-)
-NOT_METRIC_GIVEN = (
-    "depth is not metric, as a note beside it says (depth_cue.json); all lengths are in a unit of its own"
-)
-NOT_METRIC_RELATIVE = (
-    "depth is not metric: the depth network gives relative depth, which was scaled to the motion of the camera; all "
-    "lengths are in a unit of its own"
-)
 
 
 @on_one_blas_thread

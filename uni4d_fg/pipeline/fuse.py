@@ -7,9 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from uni4d_fg.arrays import FloatArray, ImageArray, IntArray
+from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.files import remove_file
@@ -17,21 +15,18 @@ from uni4d_fg.frontend.sequence.frames import FramesInTurn
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
 from uni4d_fg.optim.threads import thread_count
+from uni4d_fg.pipeline.control import BegunControl, static_control, with_moving
 from uni4d_fg.pipeline.dense_maps import DenseMaps
 from uni4d_fg.pipeline.fuse_parts import can_be_sent, fuse_in_parts
 from uni4d_fg.pipeline.fused_frames import fused_frames
-from uni4d_fg.pipeline.landmark_sigma import landmark_shares
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.pipeline.window_workers import WindowWorkers
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.confidence_store import ConfidenceWriter, write_confidence
 from uni4d_fg.results.depth_store import DepthWriter, write_depth
-from uni4d_fg.results.fusion.broken_frames import contradicting_frames
-from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.results.fusion.multiview.ideal_size import ideal_size
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 from uni4d_fg.results.fusion.told_error import ToldError
@@ -53,6 +48,7 @@ def fuse_depth(
     zoom: FloatArray | None = None,
     lens: Lens = PINHOLE,
     workers: WindowWorkers | None = None,
+    static: BegunControl | None = None,
 ) -> dict[str, Any]:
     """Write the fused depth of all frames, and how sure it is where static depth is made as a field.
 
@@ -68,6 +64,7 @@ def fuse_depth(
         zoom: (T,) focal length of each frame over that of the record's intrinsics; None without a zoom.
         lens: Distortion of the images.
         workers: Processes of this machine that make parts of the frames, if they can read them; the result is the same.
+        static: What landmarks say of the frames, if that was begun before.
 
     Returns:
         What the summary says of it: ``facts``, ``warnings`` and ``broken_frames``.
@@ -83,9 +80,8 @@ def fuse_depth(
         masks=FramesInTurn(sequence.masks),
     )
     intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)
-    shares = landmark_shares(labelled, scene, intrinsics)
-    control = [control_points(labelled, scene, motion, frame, shares) for frame in range(sequence.num_frames)]
-    broken = contradicting_frames(control, config)
+    known = static_control(labelled, scene, intrinsics, config) if static is None else static.of(scene)
+    control = [with_moving(points, labelled, scene, motion, frame) for frame, points in enumerate(known.frames)]
     plain = WorkingSize.of(sequence.image_size, config.multiview.longer_side_px)
     size = ideal_size(plain, lens, intrinsics[0]) if zoom is None else plain
     maps = DenseMaps(
@@ -94,7 +90,7 @@ def fuse_depth(
         scene,
         config,
         intrinsics,
-        frozenset(broken),
+        frozenset(known.broken),
         _unmatchable(config, zoom, size),
         thread_count(),
         size or plain,
@@ -166,23 +162,3 @@ def _summary(maps: DenseMaps, told: ToldError) -> dict[str, Any]:
             f"made without it: {some_of(broken)}"
         ]
     return out
-
-
-def control_points(
-    labelled: LabelledTracks, scene: Arrays, motion: Arrays, frame: int, shares: FloatArray | None = None
-) -> ControlPoints:
-    """Collect the landmarks, with the shares (L,) of their weights, and dynamic points that a frame sees with a cue."""
-    pose = scene["world_T_cam"][frame]
-    static_track: IntArray = scene["landmark_track"]
-    seen = (labelled.weight[static_track, frame] > 0) & np.isfinite(labelled.depth[static_track, frame])
-    moving_track: IntArray = motion["track"]
-    here = motion["observed"][:, frame] & np.isfinite(labelled.depth[moving_track, frame])
-    track = np.concatenate([static_track[seen], moving_track[here]]).astype(np.int64)
-    points: FloatArray = np.concatenate([scene["landmarks"][seen], motion["points"][here, frame]])
-    instance = np.concatenate([np.zeros(int(seen.sum())), motion["instance"][here]]).astype(np.int32)
-    z = world_to_camera(np.broadcast_to(pose, (len(points), 4, 4)), points)[:, 2]
-    cue = labelled.depth[track, frame].astype(np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        log_scale = np.where(z > 0, np.log(np.maximum(z, 1e-9)) - np.log(cue), np.nan)
-    share = None if shares is None else np.concatenate([shares[seen], np.ones(int(here.sum()))])
-    return ControlPoints(labelled.tracks.uv[track, frame].astype(np.float64), cue, log_scale, instance, points, share)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.gather import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
+from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.factors.variable_types import CUE_SCALE, GRAVITY, IMU_BIAS
 from uni4d_fg.optim.added_factors import AddingRunner

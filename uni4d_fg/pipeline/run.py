@@ -19,9 +19,9 @@ from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.counted import counted
-from uni4d_fg.cues.gather import NOT_METRIC_GIVEN
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
 from uni4d_fg.cues.plan import CueReport
+from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
@@ -43,6 +43,7 @@ from uni4d_fg.optim.threads import one_blas_thread, thread_limit
 from uni4d_fg.pipeline.asked import check_asked
 from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
+from uni4d_fg.pipeline.control import BegunControl, static_control
 from uni4d_fg.pipeline.fingerprint import sequence_digest, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import GraphValues, kinds_of, remove_graphs
@@ -69,6 +70,7 @@ from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.association.fragments import FragmentSearch
 from uni4d_fg.slam.loops.closing import LoopClosing
+from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.windows.plan import Window, windows_of
 
 ValueT = TypeVar("ValueT")
@@ -281,16 +283,21 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
     if loops is not None:
         # Not a source of the user's: it adds nothing to single windows, which workers may then solve.
         run_stage = with_additions(run.recorder, (*run.sources, loops))
+    zoom = camera.zoom if camera.zoom is None or repeats is None else camera.zoom[repeats.shown]
+    static = BegunControl(
+        lambda scene: static_control(
+            labelled, scene, zoomed(scene["intrinsics"], zoom, sequence.num_frames), config.fusion
+        )
+    )
     key, scene, motion = _stages(
-        run, key, *camera.apply(solved, solved_tracks, config), windows, run_stage, fragments, loops
+        run, key, *camera.apply(solved, solved_tracks, config), windows, run_stage, fragments, loops, static
     )
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)
     adjusted = summary.stages["bundle_adjustment"]
     adjusted["facts"] = [*adjusted.get("facts", []), *measured.facts]
     key = stage_key(key, config.fusion)
-    zoom = camera.zoom if camera.zoom is None or repeats is None else camera.zoom[repeats.shown]
-    _fuse(run, key, labelled, scene, motion, zoom, camera.lens)
+    _fuse(run, key, labelled, scene, motion, zoom, camera.lens, static)
     reconstruction = assemble(sequence, labelled, scene, motion, camera.lens, zoom)
     write_result(folder, reconstruction)
     began = time.perf_counter()
@@ -330,6 +337,7 @@ def _stages(
     run_stage: StageRunner,
     fragments: FragmentSearch | None,
     loops: LoopClosing | None,
+    static: BegunControl,
 ) -> tuple[str, Arrays, Arrays]:
     """Run stages 1 to 3, as one graph or in windows, and the joint solve.
 
@@ -359,6 +367,8 @@ def _stages(
             )
             key = stage_key(key, config.nonrigid, *_searched(config))
             after = key
+            if run.workers is not None:
+                static.begin(scene)  # while they solve windows this process is idle
             return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
     inertial = [] if run.imu is None else [config.imu, run.imu.digest()]
@@ -445,14 +455,9 @@ def _labels(run: _Run, key: str, images: bytes) -> tuple[str, LabelledTracks]:
 
 
 def _fuse(
-    run: _Run,
-    key: str,
-    labelled: LabelledTracks,
-    scene: Arrays,
-    motion: Arrays,
-    zoom: FloatArray | None,
-    lens: Lens,
-) -> None:
+    run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays, zoom: FloatArray | None, lens: Lens,
+    static: BegunControl,
+) -> None:  # fmt: skip
     expected = (run.sequence.num_frames, *run.sequence.image_size)
     stored = run.folder.depth
     if run.resume and not _readable(
@@ -466,19 +471,11 @@ def _fuse(
             run.store.discard("fusion")
 
     def compute(hooks: Hooks) -> StageRecord:
+        workers = None if run.workers is None else run.workers.at_hand()
         summary = fuse_depth(
-            run.folder,
-            run.sequence,
-            labelled,
-            scene,
-            motion,
-            run.config.fusion,
-            run.reporter,
-            run.should_stop,
-            zoom,
-            lens,
-            None if run.workers is None else run.workers.at_hand(),
-        )
+            run.folder, run.sequence, labelled, scene, motion, run.config.fusion, run.reporter, run.should_stop,
+            zoom, lens, workers, static,
+        )  # fmt: skip
         return StageRecord({}, summary)
 
     run.written.wait()  # depth takes the most space: whether there is any, the small files should say

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,17 +34,26 @@ class StageStore:
         """Return the file of a stage."""
         return self.folder / f"{name}.npz"
 
-    def load(self, name: str, key: str | None = None) -> StageRecord | None:
-        """Return a stage's record if it is there, readable and of this key (any key when None)."""
+    def load(self, name: str, key: str | None = None, arrays: Iterable[str] | None = None) -> StageRecord | None:
+        """Return a stage's record if it is there, readable and of this key (any key when None).
+
+        Args:
+            name: Of the stage.
+            key: Its key.
+            arrays: Those that are read; None for all of them.
+        """
         path = self.path(name)
         if not path.exists():
             return None
         try:
-            arrays = load_npz(path, {"key": None, "summary": None})
-            stored = str(arrays.pop("key"))
+            told: dict[str, None] = {"key": None, "summary": None}
+            found = load_npz(
+                path, told if arrays is None else told | dict.fromkeys(arrays), None if arrays is None else {}
+            )
+            stored = str(found.pop("key"))
             if key is not None and stored != key:
                 return None
-            return StageRecord(arrays, json.loads(str(arrays.pop("summary"))))
+            return StageRecord(found, json.loads(str(found.pop("summary"))))
         except (InputError, ValueError, KeyError):
             return None
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.gather import NOT_METRIC_GIVEN
+from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.files import atomic_write_json, atomic_write_text, remove_file
 from uni4d_fg.frontend.sequence.model import Sequence

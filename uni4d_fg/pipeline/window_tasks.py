@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar, overload
 
@@ -49,9 +49,9 @@ class Place:
         """Write it. Raises OutputError."""
         self.store.save(self.file, self.key, record)
 
-    def load(self) -> StageRecord:
-        """Read it. Raises InputError if it is not there any more."""
-        record = self.store.load(self.file, self.key)
+    def load(self, arrays: Iterable[str] | None = None) -> StageRecord:
+        """Read it, or some of its arrays. Raises InputError if it is not there any more."""
+        record = self.store.load(self.file, self.key, arrays)
         if record is None:
             raise InputError(f"{self.store.folder}: the record of frames {self.window} is gone; start again")
         return record
@@ -86,6 +86,8 @@ class InformationItem:
     cameras: Cameras | None
     """Joined; None to linearize it where it was solved."""
     log_scale_priors: bool
+    uncertain: bool
+    """Whether covariances will be made of it."""
     config: Config
 
 
@@ -139,7 +141,9 @@ def window_information(item: InformationItem, run: StageRunner, hooks: Hooks) ->
     if item.cameras is not None:
         scene = place(scene, item.cameras, item.config.bundle_adjustment, run)
     mine = owned(scene, item.spans, item.windows, item.index)
-    return information(mine, item.windows, item.index, item.config, log_scale_priors=item.log_scale_priors)
+    return information(
+        mine, item.windows, item.index, item.config, log_scale_priors=item.log_scale_priors, uncertain=item.uncertain
+    )
 
 
 def window_landmarks(item: LandmarksItem, run: StageRunner, hooks: Hooks) -> WindowLandmarks:

@@ -87,6 +87,7 @@ class WindowedRun:
     def records(
         self, places: list[Place], make: Callable[[int, Place], ItemT],
         solve: Callable[[ItemT, StageRunner, Hooks], ResultT], hooks: Hooks, keep: Callable[[StageRecord], KeptT],
+        arrays: Iterable[str] | None = None,
     ) -> tuple[list[KeptT], dict[int, ResultT]]:  # fmt: skip
         """Make sure that every window has its record: the stored one of the same key when resuming, else a new one.
 
@@ -98,6 +99,7 @@ class WindowedRun:
             solve: Solves it and writes its record.
             hooks: Progress and cancellation.
             keep: Returns what is needed of a record; they are read while other windows are solved.
+            arrays: Of a record, those that this takes; None for all of them.
 
         Returns:
             What is kept of each record, and what the solves of windows that had none returned.
@@ -111,7 +113,7 @@ class WindowedRun:
         last = len(windows) - 1
         kept, results = dict[int, KeptT](), dict[int, ResultT]()
         for index in range(last if self.resume else 0):
-            stored = self.store.load(places[index].file, places[index].key)
+            stored = self.store.load(places[index].file, places[index].key, arrays)
             if stored is not None:
                 kept[index] = keep(stored)
         left = [index for index in range(len(windows)) if index not in kept]
@@ -119,7 +121,7 @@ class WindowedRun:
         done = sum(len(windows[index]) for index in kept)
         for number, result in self.solve_each(hooks)(solve, items):
             index = left[number]
-            results[index], kept[index] = result, keep(places[index].load())
+            results[index], kept[index] = result, keep(places[index].load(arrays))
             done += len(windows[index])
             self.reporter.advance(done, f"frames {windows[index]} of {windows[-1].stop}")
         return [kept[index] for index in range(len(windows))], results
@@ -145,10 +147,10 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
     def item(index: int, place: Place) -> SceneItem:
         tracks = tracks_in(labelled, windows[index].frames)
         times = windowed.sequence.timestamps
-        return SceneItem(place, tracks, intrinsics, initial, times, config, share.item(index, place, None))
+        return SceneItem(place, tracks, intrinsics, initial, times, config, share.item(0, index, place, None))
 
     places = windowed.places("scene", key)
-    told, known = windowed.records(places, item, solve_window_scene, hooks, _told)
+    told, known = windowed.records(places, item, solve_window_scene, hooks, _told, _TOLD)
     for one in told:
         solves += one.solves
         dropped.update(one.dropped)
@@ -197,10 +199,12 @@ class _Told:
     cameras: Cameras
 
 
+_TOLD = ("world_T_cam", "intrinsics", "log_scale")
+
+
 def _told(record: StageRecord) -> _Told:
-    arrays, summary = record.arrays, record.summary
-    cameras = Cameras(arrays["world_T_cam"], arrays["intrinsics"], arrays["log_scale"])
-    return _Told(summary["solves"], summary["dropped"], cameras)
+    cameras = Cameras(*(record.arrays[name] for name in _TOLD))
+    return _Told(record.summary["solves"], record.summary["dropped"], cameras)
 
 
 @dataclass(frozen=True)
@@ -212,9 +216,12 @@ class _Shared:
     log_scale_priors: bool
     config: Config
 
-    def item(self, index: int, place: Place, cameras: Cameras | None) -> InformationItem:
-        """Return what a window is linearized from."""
-        return InformationItem(place, self.windows, index, self.spans, cameras, self.log_scale_priors, self.config)
+    def item(self, number: int, index: int, place: Place, cameras: Cameras | None) -> InformationItem:
+        """Return what a window is linearized from, in round ``number``: covariances are those of the last one."""
+        last = number == self.config.windows.rounds - 1
+        return InformationItem(
+            place, self.windows, index, self.spans, cameras, self.log_scale_priors, last, self.config
+        )  # fmt: skip
 
 
 def _in_order(found: Iterable[tuple[int, ResultT]]) -> list[ResultT]:
@@ -263,7 +270,7 @@ def _join(
     known = dict(known)
     for number in range(windowed.config.windows.rounds):
         left = [index for index in range(len(places)) if index not in known]
-        items = [share.item(index, places[index], cameras if number else None) for index in left]
+        items = [share.item(number, index, places[index], cameras if number else None) for index in left]
         for at, part in windowed.solve_each(hooks)(window_information, items):
             known[left[at]] = part
         parts = [known.pop(index) for index in range(len(places))]

@@ -46,7 +46,9 @@ def kill_one(mark: Path, killed: list[int]) -> None:
     while not mark.exists() and time.monotonic() < end:
         time.sleep(0.01)
     for child in own.children(recursive=True):
-        if "spawn_main" in " ".join(child.cmdline()):
+        # What starts them on Linux has their command line, and is no worker.
+        command = " ".join(child.cmdline())
+        if "spawn_main" in command or ("forkserver" in command and child.ppid() != own.pid):
             child.kill()
             killed.append(child.pid)
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -93,6 +94,23 @@ def test_large_arrays_are_not_mapped_anew_each_time(client: Any) -> None:
     faults = [future.result(timeout=120) for future in asked]
     # 200 arrays of 4 MB are 204,800 pages.
     assert max(faults) < 20_000
+
+
+def test_a_script_that_workers_cannot_load_is_told_so(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pathlib import Path\n"
+        "from uni4d_fg.pipeline.workers.cluster import open_workers\n"
+        "from uni4d_fg.pipeline.workers.options import WorkerOptions\n"
+        f"with open_workers(WorkerOptions(workers=1), 1, Path({str(tmp_path)!r})) as client:\n"
+        "    print(client.submit(len, 'ab').result())\n"
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=False)
+    assert ended.returncode != 0
+    assert "\nuni4d_fg.errors.ConfigError: worker processes did not start" in ended.stderr
+    guarded = script.read_text().replace("with open", 'if __name__ == "__main__":\n  with open')
+    script.write_text(guarded)
+    assert subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300).stdout == "2\n"
 
 
 def test_one_that_hangs_again_and_again_is_given_up_and_says_where_it_was(client: Any, tmp_path: Path) -> None:

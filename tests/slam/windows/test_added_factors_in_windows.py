@@ -28,7 +28,7 @@ from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.slam.reconstruction import Reconstruction
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.added_terms import added_terms
-from uni4d_fg.slam.windows.information import WindowInformation
+from uni4d_fg.slam.windows.information import Uncertainty, WindowInformation
 from uni4d_fg.slam.windows.join import join
 from uni4d_fg.slam.windows.plan import Window
 
@@ -134,7 +134,11 @@ def test_the_join_with_added_terms_is_the_dense_minimum(rng: np.random.Generator
         gradient = root.T @ rng.normal(size=size)
         parts.append(
             WindowInformation(
-                window, cameras.part(window.start, window.stop), root.T @ root, gradient, root.T @ root, None
+                window,
+                cameras.part(window.start, window.stop),
+                root.T @ root,
+                gradient,
+                Uncertainty(root.T @ root, None),
             )
         )
     map_T_world = se3.se3_exp(np.array([0.4, -0.2, 0.3, 1.0, 2.0, 3.0]))

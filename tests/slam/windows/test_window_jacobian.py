@@ -24,7 +24,7 @@ def window_and_cameras(rng: np.random.Generator, count: int, before: int) -> tup
     size = FRAME * count + SHARED
     nothing = np.zeros((size, size))
     here = Cameras(moved, rng.normal(size=4), rng.normal(scale=0.1, size=count))
-    return WindowInformation(window, here, nothing, np.zeros(size), nothing, None), cameras
+    return WindowInformation(window, here, nothing, np.zeros(size)), cameras
 
 
 def dense(jacobian: WindowJacobian) -> np.ndarray:

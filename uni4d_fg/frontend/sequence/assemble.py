@@ -106,7 +106,7 @@ def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> Gr
             )
         intrinsics = intrinsics.astype(np.float64)
     if points is not None:
-        points = points.astype(np.float64)
+        points = points.astype(np.float64, copy=False)
     if instance is not None or poses is not None:
         if instance is None or poses is None or poses.shape != (len(instance), num_frames, 4, 4):
             raise SequenceProblem(

@@ -107,7 +107,7 @@ class RawTracks:
         for problem in self.problems(num_frames, size):
             raise problem
         visible: BoolArray = (self.visible == 1) & ~self.outside(size)
-        uv = np.where(visible[..., None], self.uv, np.nan).astype(np.float32)
+        uv = np.where(visible[..., None], self.uv, np.nan).astype(np.float32, copy=False)
         query: Int32Array
         if self.query_frame is not None:
             query = self.query_frame.astype(np.int32)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -33,7 +35,8 @@ def open_workers(options: WorkerOptions, count: int, folder: Path, module: str |
     Raises:
         MissingDependencyError: If ``distributed`` is not installed.
         InputError: If the scheduler does not answer, or its workers do not see the folder.
-        ConfigError: If its workers have several threads, or another version of this package.
+        ConfigError: If its workers have several threads, or another version of this package; or if processes of this
+            machine cannot start.
     """
     distributed = import_distributed()
     with ExitStack() as stack:
@@ -53,27 +56,53 @@ def _local(distributed: Any, options: WorkerOptions, count: int, module: str | N
     # Dask's own trim threshold of 64 KiB has every large array mapped anew: a third of a run's time.
     variables = {**dict.fromkeys(_THREAD_VARIABLES, options.threads), **SETTINGS}
     environment = {f"distributed.nanny.pre-spawn-environ.{name}": str(value) for name, value in variables.items()}
+    modules = [_PRELOAD, *([] if module is None else [module])]
     changed = {
+        "distributed.worker.multiprocessing-method": _start_method(distributed, modules),
         # Retries are counted by who gives the tasks out: the scheduler says at once that a worker died.
         "distributed.scheduler.allowed-failures": 0,
         # A worker that is started again is given up for good if it is not there by then; a busy machine takes long.
         "distributed.deploy.lost-worker-timeout": _RESTART,
         # Tracks and landmarks of a part of a video are more than what Dask takes for a mistake.
         "distributed.admin.large-graph-warning-threshold": "1 GB",
-        # Dask's profiler takes the interpreter from the task a hundred times a second.
+        # Dask's profiler takes the interpreter from the task a hundred times a second, and what watches its event loops
+        # and the machine does so fifty times.
         "distributed.worker.profile.enabled": False,
+        "distributed.admin.tick.interval": "1s",
+        "distributed.admin.tick.cycle": "10s",
+        "distributed.admin.system-monitor.interval": "60s",
         **environment,
     }
-    with (
-        dask.config.set(changed),
-        distributed.LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address="127.0.0.1:0",
-            host="127.0.0.1", preload=[_PRELOAD, *([] if module is None else [module])], silence_logs=logging.CRITICAL,
-        ) as cluster,
-        distributed.Client(cluster, timeout=_START_SECONDS) as client,
-    ):  # fmt: skip
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(changed))
+        try:
+            cluster = stack.enter_context(distributed.LocalCluster(
+                n_workers=count, threads_per_worker=1, processes=True, memory_limit=0,
+                dashboard_address="127.0.0.1:0", host="127.0.0.1", preload=modules, silence_logs=logging.CRITICAL,
+            ))  # fmt: skip
+        except RuntimeError as error:
+            raise ConfigError(
+                "worker processes did not start; they load the script that asks for them, which must do so under "
+                '`if __name__ == "__main__":` and be a file; where that is so, what they printed says why'
+            ) from error
+        client = stack.enter_context(distributed.Client(cluster, timeout=_START_SECONDS))
         client.wait_for_workers(1, timeout=_START_SECONDS)
         yield client
+
+
+def _start_method(distributed: Any, modules: list[str]) -> str:
+    """Return how processes are started: on Linux as forks of one that has loaded the modules, once for all of them.
+
+    That process has no threads, for it does nothing but fork. It ends with this one.
+    """
+    if not sys.platform.startswith("linux"):
+        return "spawn"
+    import dask
+
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        distributed.utils.get_mp_context()  # has the process load what Dask's own tests need; ours takes its place
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed.nanny", *modules])
+    return "forkserver"
 
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
@@ -255,5 +254,7 @@ def measured_smoothness(
         assumption = prior * float(np.sum(log_sigma + 0.5 * assumed[[0, 3]] ** 2 / variance))
         return float(quadratic + spread + assumption)
 
-    found = scipy.optimize.minimize(cost, np.log(data.smoothness[[0, 3]]), method="Nelder-Mead", tol=1e-2)
+    from scipy.optimize import minimize  # takes a tenth of a second to load, which most runs need not wait for
+
+    found = minimize(cost, np.log(data.smoothness[[0, 3]]), method="Nelder-Mead", tol=1e-2)
     return np.repeat(np.exp(found.x), 3)

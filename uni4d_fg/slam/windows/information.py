@@ -20,6 +20,16 @@ SHARED = 4
 
 
 @dataclass(frozen=True)
+class Uncertainty:
+    """What the covariances of a window's cameras are made of, besides its information."""
+
+    curvature: FloatArray
+    """(n, n) the Hessian with the mean slopes of the kernels."""
+    spread: Spread | None
+    """Of the gradient; None where errors count as independent."""
+
+
+@dataclass(frozen=True)
 class WindowInformation:
     """What one window knows: columns are 7 per frame (twist, log-scale) and 4 for the intrinsics."""
 
@@ -30,10 +40,8 @@ class WindowInformation:
     """(n, n); zero in the columns of the first pose."""
     gradient: FloatArray
     """(n,)."""
-    curvature: FloatArray
-    """(n, n) the Hessian with the mean slopes of the kernels, for covariances."""
-    spread: Spread | None
-    """Of the gradient; None where errors count as independent."""
+    uncertainty: Uncertainty | None = None
+    """None where no covariances are asked for: it takes as long as the rest, and is twice as large."""
 
     def columns(self, num_frames: int) -> IntArray:
         """Return the place (n,) of its columns among those of all frames."""

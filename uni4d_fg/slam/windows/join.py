@@ -31,7 +31,7 @@ from uni4d_fg.slam.windows.join_covariance import joined_covariances
 from uni4d_fg.slam.windows.plan import Window
 
 _STEP_SIZE = 1e-9
-"""A Gauss-Newton step below this ends the solve (rad, m, log)."""
+"""A Gauss-Newton step below this ends the solve (rad, m, log), or one that lets expect that the next is."""
 _MAX_STEPS = 10
 _MAX_STEPS_ADDED = 50
 """With added factors, whose kernels are reweighted from step to step."""
@@ -110,6 +110,7 @@ def join(
     base = FRAME * num_frames + SHARED
     free = _free_columns(start, added)
     free[base - SHARED : base] = False
+    size = np.inf
     for _ in range(_MAX_STEPS if added is None else _MAX_STEPS_ADDED):
         gradient, matrices = np.zeros(len(free)), []
         for part in information:
@@ -127,7 +128,10 @@ def join(
         cameras = _moved(cameras, step[:base])
         if added is not None:
             added.move(step)
-        if np.abs(step).max() < _STEP_SIZE:
+        # Steps shrink by a factor that hardly changes: where it is small, the last one need not be made to be known.
+        size, before = float(np.abs(step).max()), size
+        expected = size * size / before if size < 0.1 * before < np.inf else np.inf
+        if min(size, expected) < _STEP_SIZE:
             break
     return Joined(cameras, information, intrinsics_covariance, added)
 

@@ -29,7 +29,7 @@ def joined_covariances(
     """Return pose (T, 6, 6) and intrinsics (4, 4) covariances.
 
     Args:
-        information: Of every window.
+        information: Of every window, with what covariances are made of.
         cameras: The solution.
         free: (size,) columns that are uncertain.
         known: (4, 4) information on the intrinsics that is not the windows'.
@@ -40,12 +40,13 @@ def joined_covariances(
     """
     num_frames = len(cameras.world_T_cam)
     jacobians = [part.difference(cameras)[1] for part in information]
-    curvatures = [j.congruent(part.curvature) for part, j in zip(information, jacobians, strict=True)]
+    uncertainties = [part.uncertainty for part in information if part.uncertainty is not None]
+    curvatures = [j.congruent(one.curvature) for one, j in zip(uncertainties, jacobians, strict=True)]
     curvatures[0][-4:, -4:] += known
     scores = _scores(information, jacobians, num_frames, len(free))
     rests = []
-    for part, j in zip(information, jacobians, strict=True):
-        rests.append(np.zeros_like(part.curvature) if part.spread is None else j.congruent(part.spread.rest))
+    for one, j in zip(uncertainties, jacobians, strict=True):
+        rests.append(np.zeros_like(one.curvature) if one.spread is None else j.congruent(one.spread.rest))
     rests[0][-4:, -4:] += known
 
     windows, entries = [part.window for part in information], [] if added is None else added.linearize(cameras)[1]
@@ -75,7 +76,9 @@ def _scores(
     information: list[WindowInformation], jacobians: list[WindowJacobian], num_frames: int, size: int
 ) -> FloatArray | None:
     """Return one row (G, size) per cluster of landmarks; None where errors count as independent."""
-    spreads = [part.spread for part in information if part.spread is not None]
+    spreads = [
+        part.uncertainty.spread for part in information if part.uncertainty is not None and part.uncertainty.spread
+    ]
     if len(spreads) < len(information):
         return None
     scores = np.zeros((max(len(spread.scores) for spread in spreads), size))

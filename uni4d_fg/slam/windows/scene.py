@@ -18,7 +18,7 @@ from uni4d_fg.factors.priors import log_scale_prior
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.optim.cluster_robust import curvature_batch, gradient_spread
+from uni4d_fg.optim.cluster_robust import Spread, curvature_batch, gradient_spread
 from uni4d_fg.optim.layout import DenseLayout
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.marginalization import determined_points
@@ -39,7 +39,7 @@ from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
 from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import landmark_errors, spatial_inliers
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
-from uni4d_fg.slam.windows.information import WindowInformation
+from uni4d_fg.slam.windows.information import FRAME, SHARED, Uncertainty, WindowInformation
 from uni4d_fg.slam.windows.numbered import NumberedRunner
 from uni4d_fg.slam.windows.plan import (
     TrackSpans,
@@ -79,8 +79,8 @@ class WindowScene:
         cameras, seen, noise = self.cameras, self.observations, self.noise
         return {
             "world_T_cam": cameras.world_T_cam, "log_scale": cameras.log_scale, "intrinsics": cameras.intrinsics,
-            "landmark": self.landmark, "track": self.track, "row": seen.track, "frame": seen.frame, "uv": seen.uv,
-            "depth": seen.depth, "weight": seen.weight,
+            "landmark": self.landmark, "track": self.track, "row": seen.track, "frame": seen.frame,
+            "uv": _as_measured(seen.uv), "depth": _as_measured(seen.depth), "weight": seen.weight,
             "noise": np.array([noise.reprojection_sigma_px, noise.depth_sigma, noise.depth_correlation]),
             **({} if self.acceleration is None else self.acceleration.arrays()),
         }  # fmt: skip
@@ -93,10 +93,22 @@ class WindowScene:
             Cameras(arrays["world_T_cam"], arrays["intrinsics"], arrays["log_scale"]),
             arrays["landmark"],
             arrays["track"],
-            Observations(arrays["row"], arrays["frame"], arrays["uv"], arrays["depth"], arrays["weight"]),
+            Observations(
+                arrays["row"],
+                arrays["frame"],
+                arrays["uv"].astype(np.float64, copy=False),
+                arrays["depth"].astype(np.float64, copy=False),
+                arrays["weight"],
+            ),
             StaticNoise(*arrays["noise"].tolist()),
             AccelerationPrior.of_arrays(arrays),
         )
+
+
+def _as_measured(values: FloatArray) -> FloatArray | Float32Array:
+    """Return values in single precision if that is what they came in: half the bytes, without time to compress them."""
+    single: Float32Array = values.astype(np.float32)
+    return single if np.array_equal(single, values, equal_nan=True) else values
 
 
 @dataclass(frozen=True)
@@ -260,8 +272,9 @@ def owned(scene: WindowScene, spans: TrackSpans, windows: list[Window], index: i
 
 
 def information(
-    scene: WindowScene, windows: list[Window], index: int, config: Config, *, log_scale_priors: bool = True
-) -> WindowInformation:
+    scene: WindowScene, windows: list[Window], index: int, config: Config, *, log_scale_priors: bool = True,
+    uncertain: bool = True,
+) -> WindowInformation:  # fmt: skip
     """Linearize what a window owns at its present point and eliminate its landmarks; intrinsics have no prior here.
 
     Args:
@@ -270,6 +283,7 @@ def information(
         index: Which of them.
         config: The whole configuration.
         log_scale_priors: Whether the priors on the frames' log-scales are among it.
+        uncertain: Whether covariances will be made of it.
 
     Raises:
         SolverError: If a factor is not finite.
@@ -288,21 +302,36 @@ def information(
     known = determined_points(batches, state)
     free = {**problem.free, LANDMARK: np.tile(known[:, None], (1, 3))}
     batches = tuple(_on_points(batch, known) for batch in batches)
-    size = 7 * count + 4
-    nothing = np.zeros((size, size))
+    size = FRAME * count + SHARED
     reduced = reduced_hessian(Problem(batches, free), state, ba.solver)
-    curved = reduced_hessian(Problem(tuple(curvature_batch(batch, state) for batch in batches), free), state, ba.solver)
-    if reduced is None or curved is None:
-        return WindowInformation(scene.window, scene.cameras, nothing, np.zeros(size), nothing, None)
+    nothing = np.zeros((size, size))
+    if reduced is None:
+        none = Uncertainty(nothing, None) if uncertain else None
+        return WindowInformation(scene.window, scene.cameras, nothing, np.zeros(size), none)
     layout, hessian, gradient = reduced
-    onto = _frame_major(layout, count)
+    columns, place = _frame_major(layout, count)
+    both, mine = np.ix_(place, place), np.ix_(columns, columns)
+
+    def placed(matrix: FloatArray) -> FloatArray:
+        out = np.zeros((size, size))
+        out[both] = matrix[mine]
+        return out
+
+    slope = np.zeros(size)
+    slope[place] = gradient[columns]
+    found = WindowInformation(scene.window, scene.cameras, placed(hessian), slope)
+    if not uncertain:
+        return found
+    curved = reduced_hessian(Problem(tuple(curvature_batch(batch, state) for batch in batches), free), state, ba.solver)
     clusters = track_cells(scene.observations, given, ba)
     spread = None
     if clusters is not None:
-        spread = gradient_spread(batches, state, layout, clusters, LANDMARK).project(onto)
-    return WindowInformation(
-        scene.window, scene.cameras, onto.T @ hessian @ onto, onto.T @ gradient, onto.T @ curved[1] @ onto, spread
-    )
+        own = gradient_spread(batches, state, layout, clusters, LANDMARK)
+        scores = np.zeros((len(own.scores), size))
+        scores[:, place] = own.scores[:, columns]
+        spread = Spread(scores, placed(own.rest))
+    curvature = nothing if curved is None else placed(curved[1])
+    return replace(found, uncertainty=Uncertainty(curvature, spread))
 
 
 def _owned_factors(batch: FactorBatch, mine: BoolArray) -> FactorBatch:
@@ -321,16 +350,16 @@ def _on_points(batch: FactorBatch, known: BoolArray) -> FactorBatch:
     return batch if rows is None else batch.take(np.flatnonzero(known[rows]))
 
 
-def _frame_major(layout: DenseLayout, count: int) -> FloatArray:
-    """Return the matrix (layout.size, 7 count + 4) from twist and log-scale per frame, and intrinsics, to a layout."""
-    out = np.zeros((layout.size, 7 * count + 4))
+def _frame_major(layout: DenseLayout, count: int) -> tuple[IntArray, IntArray]:
+    """Return the free columns (m,) of a layout, and their places (m,) behind twist and log-scale of every frame."""
+    place = np.zeros(layout.size, dtype=np.int64)
     start = {POSE: 0, LOG_SCALE: 6}
     for group in layout.offset:
-        for row in range(layout.count[group]):
-            columns = layout.columns(group, np.array([row]))[0]
-            first = 7 * count if group == INTRINSICS else 7 * row + start[group]
-            out[columns, first + np.arange(group.dim)] = layout.free[columns]
-    return out
+        rows = np.arange(layout.count[group])
+        first = np.full(1, FRAME * count) if group == INTRINSICS else FRAME * rows + start[group]
+        place[layout.columns(group, rows)] = first[:, None] + np.arange(group.dim)
+    columns = np.flatnonzero(layout.free)
+    return columns, place[columns]
 
 
 def finish(scene: WindowScene, cameras: Cameras, config: BundleAdjustmentConfig, run: StageRunner) -> WindowLandmarks:
