@@ -17,6 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from uni4d_fg.cli import main
 from uni4d_fg.cli.runs import stored_input
+from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.read import read_sequence
@@ -162,6 +163,13 @@ def test_cues_up_to_scale_are_up_to_scale_in_another_run(cli: Run, clip: Path, t
     summary = summary_of(tmp_path / "run")
     assert summary["cues"]["metric"] is False
     assert summary["warnings"].count(NOT_METRIC_GIVEN) == 1
+    # As on the video itself: what moves has depth only where it stands.
+    used, usual = load_config(tmp_path / "run" / "config.yaml"), load_config("default")
+    assert usual.nonrigid.depth_sigma is None
+    assert used.nonrigid.depth_sigma == usual.geometric_depth.moving_depth_sigma
+    (tmp_path / "made" / "depth_cue.json").write_text('{"metric": false, "from_motion": {"parallax": false}}')
+    assert cli("reconstruct", tmp_path / "made", "--out", tmp_path / "turned", *QUICK)[0] == 0
+    assert load_config(tmp_path / "turned" / "config.yaml").input.intrinsics == "fixed"
 
 
 def test_cues_writes_a_sequence_that_reads_back(cli: Run, clip: Path, card: Path, tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_cues_can_be_opened_again_without_the_network(tmp_path: Path, depth_card
     opened, said = load_cues(video, moved)
     np.testing.assert_array_equal(opened.depths[3], rounded(made_depth(video, 3)))
     np.testing.assert_array_equal(opened.intrinsics, made.intrinsics)
-    assert said == replace(report, settings=None)
+    assert said == replace(report)
     shutil.rmtree(moved / "depth")
     with pytest.raises(InputError, match=r"no longer there.*--resume"):
         load_cues(video, moved)
@@ -377,7 +377,7 @@ def test_without_any_cue_depth_comes_from_motion_and_is_called_not_metric(tmp_pa
     sequence, report = gather_cues(video, plan, tmp_path / "cues", ROOM_CONFIG)
     assert not report.metric
     assert report.warnings[0] == NOT_METRIC
-    assert report.settings is not None
+    assert sequence.depth_parallax
     assert sequence.initial_world_T_cam is not None
     assert all(np.isfinite(depth).all() for depth in sequence.depths)
     assert error_up_to_scale(sequence, video) < 0.04

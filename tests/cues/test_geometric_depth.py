@@ -13,7 +13,8 @@ from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
-from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion, settings_for_geometry
+from uni4d_fg.cues.depth_settings import settings_for_depth
+from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.interpolated_depth import (
     SparseInverseDepth,
     enlarged,
@@ -184,11 +185,12 @@ def test_cancelling_ends_it(scene: Simulation, static: BoolArray, calls: int) ->
 
 def test_settings_loosen_moving_depth_and_keep_the_focal_length_without_parallax() -> None:
     config = load_config("default", [])
-    assert settings_for_geometry(config).nonrigid.depth_sigma == config.geometric_depth.moving_depth_sigma
-    assert settings_for_geometry(config).input.intrinsics == "free"
-    assert settings_for_geometry(config, has_parallax=False).input.intrinsics == "fixed"
+    assert settings_for_depth(config, None) == config
+    assert settings_for_depth(config, True).nonrigid.depth_sigma == config.geometric_depth.moving_depth_sigma
+    assert settings_for_depth(config, True).input.intrinsics == "free"
+    assert settings_for_depth(config, False).input.intrinsics == "fixed"
     own = load_config("default", ["nonrigid.depth_sigma=0.02"])
-    assert settings_for_geometry(own).nonrigid.depth_sigma == 0.02
+    assert settings_for_depth(own, True).nonrigid.depth_sigma == 0.02
 
 
 def plane(uv: np.ndarray) -> np.ndarray:

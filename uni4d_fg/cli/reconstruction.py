@@ -79,6 +79,7 @@ def reconstruct(
     """
     from uni4d_fg.cli import shots
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.cues.depth_settings import settings_for_depth
     from uni4d_fg.cues.intermediate import drop_intermediate
     from uni4d_fg.frontend.measurements.imu import read_imu
     from uni4d_fg.pipeline.asked import check_asked
@@ -121,7 +122,7 @@ def reconstruct(
     def solve(video: Video, folder: Path, again: bool, warnings: tuple[str, ...] = ()) -> tuple[RunSummary, Sequence]:
         forecast = Forecast(expected_shares(video.num_frames, video.image_size, settings, plan, video.tracks))
         sequence, report = run_cues(video, plan, folder, settings, quiet=quiet, forecast=forecast)
-        chosen = settings if report is None or report.settings is None else report.settings
+        chosen = settings_for_depth(settings, sequence.depth_parallax)
         summary = run_pipeline(
             sequence, folder, chosen, resume=again, quiet=quiet, cues=report, measurements=files, imu=samples,
             warnings=warnings, forecast=forecast, workers=work,

@@ -52,6 +52,7 @@ def stream(
 ) -> None:
     """Reconstruct frame by frame over a sliding window: cameras, static and moving points of a video of any length."""
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.cues.depth_settings import settings_for_depth
     from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
     from uni4d_fg.pipeline.stream import check_stream, stream_sequence
 
@@ -70,6 +71,7 @@ def stream(
             "first with 'uni4d-fg cues'"
         )
     sequence = source.read()
+    settings = settings_for_depth(settings, sequence.depth_parallax)
     if online_tracks:
         sequence = replace(sequence, tracks=None)
     files = MeasurementFiles(odometry, gps, relative_poses)

@@ -12,7 +12,6 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.models import Config
 from uni4d_fg.counted import counted
 from uni4d_fg.cues.cache import FloatMaps
-from uni4d_fg.cues.geometric_depth import settings_for_geometry
 from uni4d_fg.cues.geometry_makers import aligned_depth, geometric_depth, moving_masks, video_key
 from uni4d_fg.cues.interpolated_depth import GridDepths
 from uni4d_fg.cues.intrinsics import shared_intrinsics
@@ -88,6 +87,7 @@ class _Gathering:
         if plan.depth == "given" and not video.depth_is_metric:
             self.report.metric = False
             self.report.warnings.append(NOT_METRIC_GIVEN)
+        self.depth_parallax = video.depth_parallax if plan.depth == "given" else None
         self.tracks = video.tracks if plan.tracks == "given" else None
         self.track_file: Path | None = None
         self.intrinsics = video.intrinsics
@@ -127,6 +127,7 @@ class _Gathering:
             replace(
                 self.video, depths=depths, masks=masks, intrinsics=self._start_intrinsics(), tracks=self.tracks,
                 initial_world_T_cam=self.world_T_cam, content=None, depth_is_metric=report.metric,
+                depth_parallax=self.depth_parallax,
             )
         )  # fmt: skip
         if not plan.is_given:
@@ -220,7 +221,7 @@ class _Gathering:
         self.motion_facts = [f"depth: {fact}" for fact in found.facts]
         if network is None:
             self.motion_warnings = [NOT_METRIC, *found.warnings]
-            report.settings = settings_for_geometry(self.config, found.has_parallax)
+            self.depth_parallax = found.has_parallax
             self.world_T_cam = found.world_T_cam
             return found.depths
         self.motion_warnings = [NOT_METRIC_RELATIVE, *found.warnings]

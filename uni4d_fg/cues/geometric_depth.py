@@ -113,27 +113,6 @@ def depth_from_motion(
     return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
 
 
-def settings_for_geometry(config: Config, has_parallax: bool = True) -> Config:
-    """Return the configuration with which to reconstruct from such depth.
-
-    Stages 1 and 2 take it like any other: they measure its noise. But moving things have depth only where they
-    stand, and the noise of the static scene says nothing of that (``geometric_depth.moving_depth_sigma`` does,
-    unless ``nonrigid.depth_sigma`` is set). Without parallax, depth is a convention that would bend the focal
-    lengths: they are kept.
-
-    Args:
-        config: Of the run.
-        has_parallax: See :class:`GeometricDepth`.
-    """
-    update: dict[str, object] = {}
-    if config.nonrigid.depth_sigma is None:
-        sigma = config.geometric_depth.moving_depth_sigma
-        update["nonrigid"] = config.nonrigid.model_copy(update={"depth_sigma": sigma})
-    if not has_parallax:
-        update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
-    return config.model_copy(update=update)
-
-
 def _static_observations(tracks: Tracks, is_static: BoolArray) -> Observations:
     track, frame = np.nonzero(tracks.visible & is_static[:, None])
     uv = tracks.uv[track, frame].astype(np.float64)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from uni4d_fg.config.models import Config
 from uni4d_fg.cues.card import CardKind, find_model
 from uni4d_fg.cues.session import weights_hash
 from uni4d_fg.frontend.sequence.assemble import check_count, open_depth
@@ -167,8 +166,6 @@ class CueReport:
     start: dict[str, Any] = field(default_factory=dict)
     """What camera motion leaves open, see :class:`~uni4d_fg.cues.geometric_depth.GeometricDepth`; empty where depth was
     given."""
-    settings: Config | None = None
-    """The configuration to reconstruct with, where these cues ask for another one."""
     seconds: float = 0.0
     """Time that this call took to make or to find them."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.depth_settings import settings_for_depth
 from uni4d_fg.cues.gather import gather_cues
 from uni4d_fg.cues.plan import plan_cues
 from uni4d_fg.frontend.measurements.imu import ImuSamples, read_imu
@@ -87,8 +88,8 @@ def reconstruct(
             sequence, report = gather_cues(
                 video, plan, folder / "cues", settings, reporter=reporter, track_cache=folder / "stages"
             )
-            settings = report.settings or settings
     cues = None if report is None else report.to_dict()
+    settings = settings_for_depth(settings, sequence.depth_parallax)
     reconstruct_sequence(
         sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions,
         measurements=measurements, imu=samples, warnings=warnings, workers=workers,

@@ -431,6 +431,20 @@ def test_depth_in_a_unit_of_its_own_says_so_in_the_folder(tmp_path: Path) -> Non
     assert read_native(folder).depth_is_metric
 
 
+@pytest.mark.parametrize("parallax", [True, False])
+def test_depth_from_motion_says_so_in_the_folder(tmp_path: Path, parallax: bool) -> None:
+    folder = tmp_path / "sequence"
+    write_native(dataclasses.replace(sample_sequence(), depth_is_metric=False, depth_parallax=parallax), folder)
+    assert read_native(folder).depth_parallax is parallax
+    note = folder / "depth_cue.json"
+    for text in ('{"metric": false, "from_motion": true}', '{"metric": false, "from_motion": {"parallax": 1}}'):
+        note.write_text(text)
+        with pytest.raises(InputError, match=r"depth_cue\.json: does not say whether the motion showed parallax"):
+            read_native(folder)
+    note.write_text('{"metric": false}')
+    assert read_native(folder).depth_parallax is None
+
+
 def test_the_note_is_of_the_usual_depth_alone(tmp_path: Path) -> None:
     folder = tmp_path / "sequence"
     write_native(dataclasses.replace(sample_sequence(), depth_is_metric=False), folder)

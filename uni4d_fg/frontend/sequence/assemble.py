@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -118,18 +119,33 @@ def load_ground_truth(path: Path, num_tracks: int | None, num_frames: int) -> Gr
     return GroundTruth(intrinsics=intrinsics, track_points=points, rigid_instance=instance, world_T_object=poses)
 
 
-def load_depth_note(path: Path) -> bool:
-    """Return whether depth is in meters, as a file beside it says.
+class DepthNote(NamedTuple):
+    """What a file beside the depth cue says of it."""
+
+    metric: bool = True
+    """Whether depth is in meters."""
+    parallax: bool | None = None
+    """See :attr:`~uni4d_fg.frontend.sequence.model.Video.depth_parallax`."""
+
+
+def load_depth_note(path: Path) -> DepthNote:
+    """Return what the file says.
 
     Raises:
-        InputError: If it does not say.
+        InputError: If it does not say whether depth is in meters, or of which kind the motion was that it is from.
     """
     note = read_json(path)
     if not isinstance(note, dict) or not isinstance(note.get("metric"), bool):
         raise SequenceProblem(
             path, "does not say whether depth is in meters", 'write {"metric": false} or {"metric": true}, or remove it'
         )
-    return bool(note["metric"])
+    motion = note.get("from_motion")
+    if motion is not None and not (isinstance(motion, dict) and isinstance(motion.get("parallax"), bool)):
+        raise SequenceProblem(
+            path, "does not say whether the motion showed parallax",
+            'write "from_motion": {"parallax": true} or {"parallax": false}, or leave it out',
+        )  # fmt: skip
+    return DepthNote(note["metric"], None if motion is None else motion["parallax"])
 
 
 def frame_names(images: ImageFolder | VideoFrames) -> tuple[str, ...]:
@@ -184,6 +200,7 @@ def as_sequence(video: Video) -> Sequence:
         frame_names=video.frame_names,
         initial_world_T_cam=video.initial_world_T_cam,
         depth_is_metric=video.depth_is_metric,
+        depth_parallax=video.depth_parallax,
         tracks=video.tracks,
         lens=video.lens,
         ground_truth=video.ground_truth,
@@ -226,6 +243,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
     if files.tracks is not None:
         tracks = load_tracks(files, files.tracks, num_frames).to_tracks(num_frames, size)
     root = files.root.resolve()
+    note = DepthNote() if files.depth_note is None else load_depth_note(files.depth_note)
     return Video(
         name=root.stem if root.is_file() else root.name,
         images=images,
@@ -234,7 +252,8 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
             default_timestamps(images) if files.timestamps is None else load_timestamps(files.timestamps, num_frames)
         ),
         depths=depths,
-        depth_is_metric=files.depth_note is None or load_depth_note(files.depth_note),
+        depth_is_metric=note.metric,
+        depth_parallax=note.parallax,
         masks=masks,
         intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
         tracks=tracks,

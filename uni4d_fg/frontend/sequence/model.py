@@ -96,6 +96,8 @@ class Video:
     """T maps (H, W), float32 meters, NaN where missing."""
     depth_is_metric: bool = True
     """Whether depth is in meters; else it is in a unit of its own."""
+    depth_parallax: bool | None = None
+    """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
     masks: FrameSource[Int32Array] | None = None
     """T label maps (H, W), int32."""
     intrinsics: FloatArray | None = None
@@ -148,6 +150,8 @@ class Sequence:
     """(T, 4, 4) poses to start from or to keep, as the config says."""
     depth_is_metric: bool = True
     """Whether depth is in meters; else it is in a unit of its own."""
+    depth_parallax: bool | None = None
+    """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
     tracks: Tracks | None = None
     """Long 2D point tracks, when the sequence brings them."""
     lens: Lens = PINHOLE

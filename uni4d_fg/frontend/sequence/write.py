@@ -82,8 +82,11 @@ def write_cues(sequence: Sequence, root: Path) -> None:
 
 def _write_cues(sequence: Sequence, folder: Path, names: tuple[str, ...]) -> None:
     _write_depth(sequence.depths, folder / DEFAULT_DEPTH, names)
-    if not sequence.depth_is_metric:
-        (folder / DEPTH_NOTE).write_text(json.dumps({"metric": False}) + "\n", encoding="utf-8")
+    note: dict[str, Any] = {"metric": sequence.depth_is_metric}
+    if sequence.depth_parallax is not None:
+        note["from_motion"] = {"parallax": sequence.depth_parallax}
+    if note != {"metric": True}:
+        (folder / DEPTH_NOTE).write_text(json.dumps(note) + "\n", encoding="utf-8")
     _write_masks(sequence.masks, folder / "masks", names, always_rgb=False)
     save_npy(folder / "K.npy", intrinsics_matrix(sequence.intrinsics))
     if sequence.tracks is not None:

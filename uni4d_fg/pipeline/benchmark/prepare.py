@@ -11,6 +11,7 @@ import numpy as np
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.depth_settings import settings_for_depth
 from uni4d_fg.cues.gather import gather_cues
 from uni4d_fg.cues.plan import plan_cues
 from uni4d_fg.errors import InputError
@@ -104,10 +105,11 @@ def prepare(task: Task, reporter: Reporter | None = None, should_stop: Callable[
     made = chosen.masks if chosen.masks in ("motion", "none") else None
     plan = plan_cues(used, bare=used.depths is None, masks=made)
     if plan.is_given:
-        return Prepared(video, as_sequence(replace(used, masks=None) if made == "none" else used), config, None)
+        sequence = as_sequence(replace(used, masks=None) if made == "none" else used)
+        return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), None)
     plan.check()
     sequence, report = gather_cues(
         used, plan, task.run_folder / "cues", config, reporter=reporter or SilentReporter(), should_stop=should_stop,
         track_cache=task.run_folder / "stages",
     )  # fmt: skip
-    return Prepared(video, sequence, report.settings or config, report.to_dict())
+    return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), report.to_dict())
