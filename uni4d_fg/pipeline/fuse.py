@@ -15,10 +15,10 @@ from uni4d_fg.frontend.sequence.frames import FramesInTurn
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.optim.extension import INSTALL_COMMAND, find_extension
 from uni4d_fg.optim.threads import thread_count
-from uni4d_fg.pipeline.control import BegunControl, static_control, with_moving
+from uni4d_fg.pipeline.control import BegunControl, with_moving
 from uni4d_fg.pipeline.dense_maps import DenseMaps
 from uni4d_fg.pipeline.fuse_parts import can_be_sent, fuse_in_parts
 from uni4d_fg.pipeline.fused_frames import fused_frames
@@ -45,10 +45,10 @@ def fuse_depth(
     config: FusionConfig,
     reporter: Reporter,
     should_stop: Callable[[], bool],
-    zoom: FloatArray | None = None,
-    lens: Lens = PINHOLE,
-    workers: WindowWorkers | None = None,
-    static: BegunControl | None = None,
+    zoom: FloatArray | None,
+    lens: Lens,
+    workers: WindowWorkers | None,
+    static: BegunControl,
 ) -> dict[str, Any]:
     """Write the fused depth of all frames, and how sure it is where static depth is made as a field.
 
@@ -64,7 +64,7 @@ def fuse_depth(
         zoom: (T,) focal length of each frame over that of the record's intrinsics; None without a zoom.
         lens: Distortion of the images.
         workers: Processes of this machine that make parts of the frames, if they can read them; the result is the same.
-        static: What landmarks say of the frames, if that was begun before.
+        static: What landmarks say of the frames.
 
     Returns:
         What the summary says of it: ``facts``, ``warnings`` and ``broken_frames``.
@@ -80,7 +80,7 @@ def fuse_depth(
         masks=FramesInTurn(sequence.masks),
     )
     intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)
-    known = static_control(labelled, scene, intrinsics, config) if static is None else static.of(scene)
+    known = static.of(scene)
     control = [with_moving(points, labelled, scene, motion, frame) for frame, points in enumerate(known.frames)]
     plain = WorkingSize.of(sequence.image_size, config.multiview.longer_side_px)
     size = ideal_size(plain, lens, intrinsics[0]) if zoom is None else plain

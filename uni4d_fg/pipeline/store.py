@@ -46,10 +46,8 @@ class StageStore:
         if not path.exists():
             return None
         try:
-            told: dict[str, None] = {"key": None, "summary": None}
-            found = load_npz(
-                path, told if arrays is None else told | dict.fromkeys(arrays), None if arrays is None else {}
-            )
+            wanted = dict.fromkeys(["key", "summary", *(arrays or ())])
+            found = load_npz(path, wanted, None if arrays is None else {})
             stored = str(found.pop("key"))
             if key is not None and stored != key:
                 return None

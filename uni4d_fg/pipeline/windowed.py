@@ -203,7 +203,7 @@ _TOLD = ("world_T_cam", "intrinsics", "log_scale")
 
 
 def _told(record: StageRecord) -> _Told:
-    cameras = Cameras(*(record.arrays[name] for name in _TOLD))
+    cameras = Cameras(**{name: record.arrays[name] for name in _TOLD})
     return _Told(record.summary["solves"], record.summary["dropped"], cameras)
 
 

@@ -11,6 +11,7 @@ import pytest
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.factors.variable_types import INTRINSICS, LOG_SCALE, POSE
+from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.pipeline.store import StageStore
@@ -28,14 +29,19 @@ def settings(*overrides: str) -> Config:
     return load_config("default", [*windows, *overrides])
 
 
+def video() -> Sequence:
+    return make_synthetic_sequence(
+        SyntheticSceneConfig(
+            num_frames=FRAMES, height=120, width=160, focal=150.0, margin_px=3.0, grid_columns=16, grid_rows=12,
+            render_images=False,
+        )
+    )  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    video = SyntheticSceneConfig(
-        num_frames=FRAMES, height=120, width=160, focal=150.0, margin_px=3.0, grid_columns=16, grid_rows=12,
-        render_images=False,
-    )  # fmt: skip
     folder = tmp_path_factory.mktemp("windows")
-    reconstruct(make_synthetic_sequence(video), folder, settings())
+    reconstruct(video(), folder, settings())
     return folder
 
 
@@ -105,11 +111,7 @@ def test_some_arrays_of_a_record_can_be_read_alone(folder: Path) -> None:
 
 @pytest.mark.parametrize("rounds", [1, 3])
 def test_covariances_come_from_the_last_round_whichever_that_is(tmp_path: Path, folder: Path, rounds: int) -> None:
-    video = SyntheticSceneConfig(
-        num_frames=FRAMES, height=120, width=160, focal=150.0, margin_px=3.0, grid_columns=16, grid_rows=12,
-        render_images=False,
-    )  # fmt: skip
-    reconstruct(make_synthetic_sequence(video), tmp_path, settings(f"windows.rounds={rounds}"))
+    reconstruct(video(), tmp_path, settings(f"windows.rounds={rounds}"))
     found, two = (load_reconstruction(path / "reconstruction.npz") for path in (tmp_path, folder))
     sigma, usual = (np.sqrt(np.trace(one.pose_covariance[1:], axis1=1, axis2=2)) for one in (found, two))
     assert np.isfinite(sigma).all()

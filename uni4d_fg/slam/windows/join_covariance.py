@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray
-from uni4d_fg.optim.cluster_robust import MIN_CLUSTERS
+from uni4d_fg.optim.cluster_robust import MIN_CLUSTERS, Spread
 from uni4d_fg.optim.few_clusters import blend
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.windows.added_terms import AddedTerms
@@ -43,7 +43,7 @@ def joined_covariances(
     uncertainties = [part.uncertainty for part in information if part.uncertainty is not None]
     curvatures = [j.congruent(one.curvature) for one, j in zip(uncertainties, jacobians, strict=True)]
     curvatures[0][-4:, -4:] += known
-    scores = _scores(information, jacobians, num_frames, len(free))
+    scores = _scores(information, [one.spread for one in uncertainties], jacobians, num_frames, len(free))
     rests = []
     for one, j in zip(uncertainties, jacobians, strict=True):
         rests.append(np.zeros_like(one.curvature) if one.spread is None else j.congruent(one.spread.rest))
@@ -73,12 +73,11 @@ class _Marginals(NamedTuple):
 
 
 def _scores(
-    information: list[WindowInformation], jacobians: list[WindowJacobian], num_frames: int, size: int
-) -> FloatArray | None:
+    information: list[WindowInformation], found: list[Spread | None], jacobians: list[WindowJacobian],
+    num_frames: int, size: int,
+) -> FloatArray | None:  # fmt: skip
     """Return one row (G, size) per cluster of landmarks; None where errors count as independent."""
-    spreads = [
-        part.uncertainty.spread for part in information if part.uncertainty is not None and part.uncertainty.spread
-    ]
+    spreads = [spread for spread in found if spread is not None]
     if len(spreads) < len(information):
         return None
     scores = np.zeros((max(len(spread.scores) for spread in spreads), size))

@@ -306,8 +306,8 @@ def information(
     reduced = reduced_hessian(Problem(batches, free), state, ba.solver)
     nothing = np.zeros((size, size))
     if reduced is None:
-        none = Uncertainty(nothing, None) if uncertain else None
-        return WindowInformation(scene.window, scene.cameras, nothing, np.zeros(size), none)
+        unknown = Uncertainty(nothing, None) if uncertain else None
+        return WindowInformation(scene.window, scene.cameras, nothing, np.zeros(size), unknown)
     layout, hessian, gradient = reduced
     columns, place = _frame_major(layout, count)
     both, mine = np.ix_(place, place), np.ix_(columns, columns)
