@@ -181,7 +181,7 @@ def list_folder(folder: Path) -> list[Path]:
         InputError: If it is no folder, or cannot be read.
     """
     try:
-        return sorted(Path(folder).iterdir())
+        return [Path(folder, name) for name in sorted(os.listdir(folder))]
     except NotADirectoryError as error:
         raise InputError(f"{folder}: is a file, but a folder is expected here; check the path") from error
     except OSError as error:

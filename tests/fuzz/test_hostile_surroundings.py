@@ -121,10 +121,10 @@ def test_failures_of_the_system_are_known(error: Any, kind: type) -> None:
 
 
 def test_unreadable_folders(sequence_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Path) -> Any:
+    def refuse(path: Path | str) -> Any:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "iterdir", refuse)
+    monkeypatch.setattr(os, "listdir", refuse)
     for verb in ("validate", "track"):
         code, out, err = judged_verb(verb, sequence_folder)
         assert code == 3

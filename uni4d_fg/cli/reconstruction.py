@@ -203,11 +203,12 @@ def run_cues(
     Raises:
         Uni4dFgError: As :func:`~uni4d_fg.cues.gather.gather_cues`.
     """
-    from uni4d_fg.cues.gather import gather_cues
     from uni4d_fg.frontend.sequence.assemble import as_sequence
 
     if plan.is_given:
         return as_sequence(replace(video, masks=None) if plan.masks == "none" else video), None
+    from uni4d_fg.cues.gather import gather_cues  # what makes cues loads much
+
     folder = run / CUE_FOLDER
     began = time.perf_counter()
     with Interruption() as stop, progress_reporter(quiet, forecast) as reporter:

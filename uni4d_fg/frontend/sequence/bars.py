@@ -7,6 +7,7 @@ brighter in some frame. A dark scene has no such edge, as what is dark in it has
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 from typing import TypeVar
 
 import numpy as np
@@ -35,6 +36,11 @@ _LEAST_CONTENT = 0.4
 _VideoT = TypeVar("_VideoT", Video, Sequence)
 
 
+def _brightest_channel(image: ImageArray) -> ImageArray:
+    """Return the maximum (H, W) over the channels of (H, W, C); NumPy is slow along short axes."""
+    return reduce(np.maximum, (image[..., channel] for channel in range(image.shape[2])))
+
+
 def find_content(images: FrameSource[ImageArray]) -> Content:
     """Return the part of the images (T of (H, W, 3) or (H, W), uint8) between black bars; all where there are none.
 
@@ -44,7 +50,7 @@ def find_content(images: FrameSource[ImageArray]) -> Content:
     brightest: ImageArray | None = None
     for frame in evenly_spread(len(images), min(_SAMPLES, len(images))).tolist():
         image = images[frame]
-        gray = image if image.ndim == 2 else image.max(axis=2)
+        gray = image if image.ndim == 2 else _brightest_channel(image)
         brightest = gray if brightest is None else np.maximum(brightest, gray)
     if brightest is None:
         return Content(0, 0, 0, 0)
