@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from uni4d_fg.arrays import FloatArray, sum_rows
 from uni4d_fg.config.models import Config
 from uni4d_fg.counted import counted
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.factors.variable_types import LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.optim.added_factors import AddingRunner
@@ -155,7 +156,7 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
         solves += one.solves
         dropped.update(one.dropped)
     cameras = chain(windows, [one.cameras for one in told])
-    cameras, covariances = _join(windowed, share, places, known, cameras, intrinsics_covariance, hooks)
+    cameras, covariances, cue_holds_scale = _join(windowed, share, places, known, cameras, intrinsics_covariance, hooks)
     items = MadeItems(range(len(windows)), lambda i: LandmarksItem(places[i], cameras, config))
     with ThreadPoolExecutor(1) as beside:
         # While workers solve windows this process is idle.
@@ -164,7 +165,7 @@ def scene_step(windowed: WindowedRun, key: str, hooks: Hooks) -> StageRecord:
         found = covariances() if made is None else made.result()
     solves += [solve_dict(s) for part in parts for s in part.solves]
     dropped["landmark far from its neighbors"] = sum(part.dropped for part in parts)
-    arrays = _joined_arrays(windows, cameras, found, parts)
+    arrays = _joined_arrays(windows, cameras, found, parts, cue_holds_scale)
     count = int(sum(part.count.sum() for part in parts))
     summary = bundle_summary(windowed.sequence, labelled, arrays, count, dropped, solves)
     summary["facts"].append(f"{len(windows)} windows of {len(windows[0])} frames, joined {config.windows.rounds} times")
@@ -252,7 +253,7 @@ def _calibration(
 def _join(
     windowed: WindowedRun, share: _Shared, places: list[Place], known: dict[int, WindowInformation], cameras: Cameras,
     intrinsics_covariance: FloatArray, hooks: Hooks,
-) -> tuple[Cameras, Callable[[], Covariances]]:  # fmt: skip
+) -> tuple[Cameras, Callable[[], Covariances], bool]:  # fmt: skip
     """Join the windows' cameras in rounds; landmarks follow before each linearization but the first.
 
     Args:
@@ -265,9 +266,9 @@ def _join(
         hooks: Progress and cancellation.
 
     Returns:
-        The cameras, and what computes their covariances.
+        The cameras, what computes their covariances, and whether nothing but the depth cue holds their scale.
     """
-    known = dict(known)
+    known, cue_holds_scale = dict(known), True
     for number in range(windowed.config.windows.rounds):
         left = [index for index in range(len(places)) if index not in known]
         items = [share.item(number, index, places[index], cameras if number else None) for index in left]
@@ -279,14 +280,16 @@ def _join(
         cameras = joined.cameras
         if added is not None:
             added.keep(windowed.run)
-        if added is None or not added.is_metric:
+        cue_holds_scale = added is None or not added.is_metric
+        if cue_holds_scale:
             cameras = Cameras.of(hold_metric_scale(cameras.state(np.zeros((0, 3)))))
-    return cameras, joined.covariances
+    return cameras, joined.covariances, cue_holds_scale
 
 
 def _joined_arrays(
-    windows: list[Window], cameras: Cameras, covariances: Covariances, parts: list[WindowLandmarks]
-) -> dict[str, npt.NDArray[Any]]:
+    windows: list[Window], cameras: Cameras, covariances: Covariances, parts: list[WindowLandmarks],
+    cue_holds_scale: bool,
+) -> dict[str, npt.NDArray[Any]]:  # fmt: skip
     """Return the arrays of a stage 2 record; a landmark of several windows counts once, as the weighted mean."""
     all_tracks = np.concatenate([part.track for part in parts])
     count = np.concatenate([part.count for part in parts]).astype(np.float64)
@@ -298,6 +301,9 @@ def _joined_arrays(
     log_scale = np.zeros(len(cameras.log_scale))
     for index, (window, part) in enumerate(zip(windows, parts, strict=True)):
         log_scale[window.start : window.stop] += blend_weight(windows, index) * part.log_scale
+    state = replace(cameras, log_scale=log_scale).state(point)
+    if cue_holds_scale:
+        state = hold_metric_scale(state)
     share = np.array([part.count.sum() for part in parts], dtype=np.float64)
     noise = np.average(
         [[part.noise.reprojection_sigma_px, part.noise.depth_sigma] for part in parts], axis=0, weights=share
@@ -306,8 +312,8 @@ def _joined_arrays(
     if not np.isfinite(pose_covariance).all():
         pose_covariance, intrinsics_covariance = unknown_covariances(len(cameras.world_T_cam))
     return {
-        "world_T_cam": cameras.world_T_cam, "intrinsics": cameras.intrinsics, "log_scale": log_scale,
-        "landmarks": point, "landmark_track": track, "landmark_error": error.astype(np.float32),
+        "world_T_cam": state[POSE], "intrinsics": cameras.intrinsics, "log_scale": state[LOG_SCALE][:, 0],
+        "landmarks": state[LANDMARK], "landmark_track": track, "landmark_error": error.astype(np.float32),
         "pose_covariance": pose_covariance, "intrinsics_covariance": intrinsics_covariance, "noise": noise,
     }  # fmt: skip
 

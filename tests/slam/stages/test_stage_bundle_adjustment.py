@@ -108,6 +108,20 @@ def test_the_scale_of_the_depth_cue_per_frame_is_found(exact: LabelledTracks, st
     )
 
 
+def test_points_with_the_depth_of_what_is_behind_them_do_not_set_the_scale(
+    exact: LabelledTracks, start: np.ndarray, rng: np.random.Generator
+) -> None:
+    observations = static_observations(exact)
+    observations.depth[:] *= np.exp(rng.normal(scale=0.005, size=len(observations)))
+    observations.depth[observations.track < TRACKS // 8] *= 1.15
+    result = adjust(observations, start)
+    length, true_length = (
+        np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() for poses in (result.cameras.world_T_cam, POSES)
+    )
+    assert abs(length / true_length - 1.0) < 0.003
+    assert abs(result.cameras.log_scale.mean()) < 1e-9
+
+
 def test_without_depth_prior_one_distance_holds_the_scale(exact: LabelledTracks) -> None:
     result = adjust(static_observations(exact), POSES, changed(depth_prior=False, structure="keep"))
     distance = np.linalg.norm(result.cameras.world_T_cam[:, :3, 3], axis=1)

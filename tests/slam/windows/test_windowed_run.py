@@ -72,6 +72,7 @@ def test_the_path_is_nearly_as_good_as_that_of_one_graph(found: Reconstruction, 
     path = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
     assert ate(found) < max(1.5 * ate(batch), 0.004 * path)
     np.testing.assert_array_equal(found.world_T_cam[0], np.eye(4))
+    assert abs(found.depth_log_scale.mean()) < 1e-6
     np.testing.assert_allclose(found.intrinsics[:2], 150.0, rtol=0.02)
 
 

@@ -227,7 +227,8 @@ def adjust_bundle(
         solves.append(summary)
         if summary.termination is Termination.CANCELLED:
             break
-        if config.depth_prior and freedom.poses and HOLDS_SCALE not in summary.notes:
+        cue_holds_scale = config.depth_prior and freedom.poses and HOLDS_SCALE not in summary.notes
+        if cue_holds_scale:
             state = hold_metric_scale(state)
         if index == rounds - 1 and energy.is_likelihood:
             covariances = _covariances(stage, state, observations, config, run)
@@ -246,6 +247,8 @@ def adjust_bundle(
     if config.structure == "refine" and energy.is_likelihood and solves[-1].termination is not Termination.CANCELLED:
         state, noise, refined = refine_structure(state, observations, noise, config, hooks, run)
         solves += refined
+        if cue_holds_scale:
+            state = hold_metric_scale(state)
     if config.structure == "relift":
         state = relift_structure(state, observations)
     keep = spatial_inliers(state[LANDMARK], config)
@@ -299,7 +302,9 @@ def hold_metric_scale(state: State) -> State:
     """Scale the world about frame 0's center so that the frames' log-scales have zero mean.
 
     Reprojection does not see the scale of the world, and the widened depth prior holds it weakly: the cue's
-    mean over all frames is the best metric scale there is.
+    mean over all frames is the best metric scale there is. After the structure was refined, it is the mean of scales
+    that were solved with the cue's own noise, so that its kernel leaves out the points whose depth is wrong for their
+    parallax (behind the edge of a surface in front); the widened prior counts them in full, and the path is 1 % long.
     """
     log_scale = state[LOG_SCALE]
     shift = float(np.mean(log_scale[:, 0]))
