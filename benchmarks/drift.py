@@ -1,6 +1,6 @@
 """Drift of the built-in tracker on compressed video, and what it does to the scale of the camera's path.
 
-    pip install av; python benchmarks/drift.py [--kbps 1000] [--set tracking.refine=auto labels.depth_edge_px=7]
+    pip install av; python benchmarks/drift.py [--kbps 1000] [--set tracking.refine=off]
 
 A synthetic scene of 640 x 480 is rendered, encoded as H.264 and decoded. The built-in tracker follows a coarse grid
 through it. Drift is the distance of a static point from where the point of its query pixel projects in truth, after 5,

@@ -90,15 +90,6 @@ class LabelConfig(Section):
     max_depth_spread: float = setting(
         0.05, "Depth is interpolated only between pixels that differ by less than this fraction.", ge=0
     )
-    depth_edge_px: int = setting(
-        0,
-        "A static track has no depth this near (in x or y) to a surface in front of it, px: its window sees both, and "
-        "moves with the front one. 0: it has; 7 is half a patch.",
-        ge=0, le=100,
-    )  # fmt: skip
-    depth_edge_step: float = setting(
-        0.07, "What is nearer to the camera by more than this fraction is in front.", gt=0, lt=1
-    )
 
 
 class InputConfig(Section):

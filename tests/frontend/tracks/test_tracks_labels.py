@@ -228,21 +228,3 @@ def test_against_the_rules_in_words(columns: list[list[float | None]], off_label
             in_band = column in (STATIC_BAND, BAND_1)
             expected = 0.5 if in_band else float(column in meaning and meaning[column] == winner)
             assert labelled.weight[k, t] == expected
-
-
-def test_a_static_track_has_no_depth_beside_a_surface_in_front() -> None:
-    frames = 6
-    depth = np.full((frames, HEIGHT, WIDTH), 2.0, np.float32)
-    depth[:, :, 50:] = 1.6  # in front, from column 50 on
-    depth[:, :, :10] = 1.9  # less than 7 % in front
-    mask = np.zeros((frames, HEIGHT, WIDTH), np.int32)
-    tracks = at_columns(*[[column] * frames for column in (13.0, 42.0, 43.6, 47.0, 53.0)])
-
-    def found(config: LabelConfig, mask: np.ndarray) -> list[float]:
-        return label_tracks(tracks, sequence(frames, mask, depth), config, InputConfig()).depth[:, 0].tolist()
-
-    none, seven = (CONFIG.model_copy(update={"depth_edge_px": reach}) for reach in (0, 7))
-    np.testing.assert_allclose(found(seven, mask), [2.0, 2.0, np.nan, np.nan, 1.6], rtol=1e-6)
-    np.testing.assert_allclose(found(none, mask), [2.0, 2.0, 2.0, 2.0, 1.6], rtol=1e-6)
-    # What moves keeps its depth: its own silhouette is where it is seen.
-    np.testing.assert_allclose(found(seven, mask + 1), [2.0, 2.0, 2.0, 2.0, 1.6], rtol=1e-6)

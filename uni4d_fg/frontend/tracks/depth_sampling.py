@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array
@@ -53,24 +52,3 @@ def sample_depth(
     value = np.where(valid.all(axis=0), bilinear, corners[nearest, columns])
     usable = one_surface & valid[nearest, columns]
     return np.where(usable, value, np.nan).astype(np.float32)
-
-
-def nearest_around(depth: Float32Array, uv: Float32Array, min_depth_m: float, reach_px: int) -> Float32Array:
-    """Return the smallest depth around positions, (N,) float32 meters; infinite where there is none.
-
-    Args:
-        depth: (H, W) meters, NaN where missing.
-        uv: (N, 2) finite pixels.
-        min_depth_m: Smaller depth is missing, meters.
-        reach_px: Half the side of the square that is looked at, px; 0 looks at nothing.
-    """
-    if reach_px == 0:
-        return np.full(len(uv), np.inf, np.float32)
-    with np.errstate(invalid="ignore"):
-        present = np.where(depth >= min_depth_m, depth, np.float32(np.inf)).astype(np.float32)
-    smallest = cv2.erode(present, np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8))
-    height, width = depth.shape
-    column = np.clip(np.rint(uv[:, 0]).astype(np.int64), 0, width - 1)
-    row = np.clip(np.rint(uv[:, 1]).astype(np.int64), 0, height - 1)
-    result: Float32Array = smallest[row, column]
-    return result

@@ -18,7 +18,7 @@ from uni4d_fg.config.cues import InputConfig, LabelConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel, Tracks
-from uni4d_fg.frontend.tracks.depth_sampling import nearest_around, sample_depth
+from uni4d_fg.frontend.tracks.depth_sampling import sample_depth
 from uni4d_fg.frontend.tracks.mask_certainty import UNCERTAIN, certain_labels
 from uni4d_fg.optim.threads import map_in_order, thread_count
 
@@ -59,7 +59,6 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
     shape = tracks.visible.shape
     found = np.full(shape, _NOT_SEEN, np.int32)
     depth = np.full(shape, np.nan, np.float32)
-    behind_an_edge = np.zeros(shape, np.bool_)
     threads = thread_count()
     for first in range(0, num_frames, _TOGETHER):
         # Frames side by side in memory: going through all tracks once for each frame takes several times as long.
@@ -71,10 +70,9 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
             partial(_look, *picture, at[rows], config, input_config)
             for picture, at, rows in zip(pictures, uv, seen, strict=True)
         ]
-        for offset, (labels, depths, behind) in enumerate(map_in_order(lambda look: look(), looks, threads)):
+        for offset, (labels, depths) in enumerate(map_in_order(lambda look: look(), looks, threads)):
             found[seen[offset], first + offset] = labels
             depth[seen[offset], first + offset] = depths
-            behind_an_edge[seen[offset], first + offset] = behind
 
     mask_id, votes, agreeing = _majority(found)
     agreed = (votes > 0) & (votes - agreeing <= config.max_off_label_fraction * votes)
@@ -85,7 +83,6 @@ def label_tracks(tracks: Tracks, sequence: Sequence, config: LabelConfig, input_
     label[agreed & (mask_id == _STATIC_ID) & ~long_enough] = TrackLabel.SHORT_STATIC
     instance = np.where(label == TrackLabel.DYNAMIC, mask_id, 0).astype(np.int32)
 
-    depth[(label != TrackLabel.DYNAMIC)[:, None] & behind_an_edge] = np.nan
     weight = _weights(found, mask_id, agreed, config.band_weight)
     return LabelledTracks(tracks, label, instance, weight, depth)
 
@@ -101,13 +98,12 @@ def _read(sequence: Sequence, frame: int) -> tuple[Int32Array, Float32Array]:
 
 def _look(
     mask: Int32Array, depth_map: Float32Array, uv: Float32Array, config: LabelConfig, input_config: InputConfig
-) -> tuple[Int32Array, Float32Array, BoolArray]:
-    """Return the certain label, the depth, and whether it is behind an edge, each (n,), at points (n, 2) px."""
+) -> tuple[Int32Array, Float32Array]:
+    """Return the certain label and the depth, each (n,), at points (n, 2) px."""
     certain = certain_labels(mask, config.band_static_px, config.band_dynamic_px)
     column, row = _nearest_pixel(uv, (mask.shape[0], mask.shape[1]))
     depth = sample_depth(depth_map, uv, input_config.min_depth_m, input_config.max_depth_m, config.max_depth_spread)
-    front = nearest_around(depth_map, uv, input_config.min_depth_m, config.depth_edge_px)
-    return certain[row, column], depth, np.asarray(front < depth * (1.0 - config.depth_edge_step))
+    return certain[row, column], depth
 
 
 def static_frames_needed(num_frames: int, config: LabelConfig) -> int:
