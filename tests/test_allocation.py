@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
 import subprocess
@@ -47,3 +48,43 @@ def test_freed_arrays_are_not_mapped_again() -> None:
 
 def test_what_the_environment_sets_stays() -> None:
     assert faults(MALLOC_MMAP_THRESHOLD_="131072") > 9 * PAGES
+
+
+RETURN = """
+import sys
+import numpy as np
+from uni4d_fg.allocation import return_free_memory
+
+def pages():
+    with open("/proc/self/statm") as counts:
+        return int(counts.read().split()[1])
+
+arrays = [np.ones(8 << 10) for _ in range(1600)]
+kept = arrays[::64]
+full = pages()
+del arrays
+return_free_memory(int(sys.argv[1]))
+print(full - pages())
+"""
+"""100 MiB in arrays too small to be mapped, of which those that stay hold up the top of the heap."""
+
+
+def returned(at_least: int) -> int:
+    """Pages that the process has fewer once nearly all arrays are freed."""
+    own = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    environment = {**own, "MALLOC_TRIM_THRESHOLD_": str(1 << 30)}  # nothing is returned unasked
+    done = subprocess.run(
+        [sys.executable, "-c", RETURN, str(at_least)], env=environment, check=True, capture_output=True, text=True
+    )
+    return int(done.stdout)
+
+
+def test_much_free_memory_is_returned() -> None:
+    assert returned(0) > 80 << 8
+    assert returned(50 << 20) > 80 << 8
+
+
+def test_little_free_memory_is_kept() -> None:
+    if not hasattr(ctypes.CDLL(None), "mallinfo2"):
+        pytest.skip("before glibc 2.33 it does not say how much is free")
+    assert returned(200 << 20) < 10 << 8

@@ -11,8 +11,8 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 SETTINGS = {"MALLOC_ARENA_MAX": 1, "MALLOC_MMAP_THRESHOLD_": 128 << 20, "MALLOC_TRIM_THRESHOLD_": 128 << 20}
 """glibc's environment variables: number of heaps; bytes from which an array is mapped; free bytes that are kept."""
@@ -34,24 +34,41 @@ def keep_freed_memory() -> None:
             mallopt(_PARAMETERS[variable], value)
 
 
-def return_free_memory() -> None:
+class _HeapUse(ctypes.Structure):
+    """glibc's ``struct mallinfo2``."""
+
+    _fields_ = (
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks")),
+        *((name, ctypes.c_size_t) for name in ("uordblks", "fordblks", "keepcost")),
+    )
+
+
+def return_free_memory(at_least: int = 0) -> None:
     """Hand freed heap pages back to the system where the C library can.
 
     For work that allocates and frees arrays of many sizes again and again: a few small arrays that live on hold up the
     top of the heap, and the process grows to a size that depends on the order of things, not on what it holds.
+
+    Args:
+        at_least: Bytes. Less free memory than this is kept: to have it again costs time, a page at a time.
     """
     trim = _of_glibc("malloc_trim")
-    if trim is not None:
-        trim(0)
+    if trim is None:
+        return
+    use = _of_glibc("mallinfo2") if at_least else None
+    if use is not None:
+        use.restype = _HeapUse
+        if use().fordblks < at_least:
+            return
+    trim(0)
 
 
 @cache
-def _of_glibc(name: str) -> Callable[..., int] | None:
+def _of_glibc(name: str) -> Any:
     """Return a function that only glibc has; None with another C library."""
     if not sys.platform.startswith("linux"):
         return None
     try:
-        found: Callable[..., int] | None = getattr(ctypes.CDLL(None), name, None)
+        return getattr(ctypes.CDLL(None), name, None)
     except OSError:
         return None
-    return found

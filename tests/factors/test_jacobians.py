@@ -21,11 +21,13 @@ from factor_samples import (
 import uni4d_fg
 from uni4d_fg.errors import SolverError
 from uni4d_fg.factors import FactorType, factor, factor_type, factor_types
+from uni4d_fg.factors import batch as batch_module
 from uni4d_fg.factors.arap import arap
 from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, static_depth_prior
 from uni4d_fg.factors.depth_reprojection import depth_reprojection
 from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection
+from uni4d_fg.factors.state import State
 from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness, velocity_smoothness
 from uni4d_fg.factors.variable import SE3
@@ -224,3 +226,17 @@ def test_projection_is_continuous_at_the_near_plane() -> None:
     z = NEAR_PLANE * np.array([1 - 1e-7, 1 + 1e-7])
     np.testing.assert_allclose(*inverse_depth(z), rtol=1e-6)
     np.testing.assert_allclose(*inverse_depth_slope(z), rtol=1e-6)
+
+
+@every_type
+def test_squared_norms_in_parts_are_those_at_once(kind: FactorType, monkeypatch: pytest.MonkeyPatch) -> None:
+    variables, data = random_case(kind, seed=4)
+    rows = np.arange(N)[::-1]
+    state = State({v: np.concatenate([variables[i] for i, w in enumerate(kind.variables) if w is v])
+                   for v in dict.fromkeys(kind.variables)})  # fmt: skip
+    slots = [rows + N * kind.variables[:i].count(v) for i, v in enumerate(kind.variables)]
+    batch = kind(*slots, **data, sigma=np.linspace(0.5, 2.0, N), weight=np.linspace(0.1, 1.0, N))
+    at_once, energy = batch.squared_norm(state), batch.energy(state)
+    monkeypatch.setattr(batch_module, "_PART_ROWS", 4)
+    np.testing.assert_allclose(batch.squared_norm(state), at_once, rtol=1e-13, atol=1e-300)
+    assert batch.energy(state) == pytest.approx(energy, rel=1e-13)

@@ -56,10 +56,11 @@ def test_a_stage_comes_back_as_it_was(solved: StageGraph, tmp_path: Path) -> Non
 
 
 def test_the_values_are_gtsams_own(solved: StageGraph, tmp_path: Path) -> None:
-    for name, text in solved.values_text().items():
+    for name, text in solved.values_text():
         (tmp_path / name).write_text(text)
     values = gtsam.Values()
     values.deserialize((tmp_path / "bundle_adjustment.final.values").read_text())
+    assert values.size() == solved.num_variables
     state: State = solved.final_state
     np.testing.assert_allclose(values.atPose3(POSE.key(2)).matrix(), state[POSE][2], atol=1e-12)
     np.testing.assert_allclose(values.atPoint3(state.keys(LANDMARK)[3]), state[LANDMARK][3], atol=1e-12)

@@ -14,6 +14,9 @@ from uni4d_fg.factors.kernels import Kernel
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
 
+_PART_ROWS = 1 << 17
+"""Factors whose residuals are made at once: millions of poses and points, a copy per factor, would fill the memory."""
+
 
 @dataclass(frozen=True)
 class Slot:
@@ -122,6 +125,9 @@ class FactorBatch:
 
     def squared_norm(self, state: State) -> FloatArray:
         """Return the whitened squared norm of every row, (N,)."""
+        if len(self) > _PART_ROWS:
+            parts = (slice(start, start + _PART_ROWS) for start in range(0, len(self), _PART_ROWS))
+            return np.concatenate([self.take(part).squared_norm(state) for part in parts])
         whitened = self.residual(state) * self._inverse_sigma()
         result: FloatArray = np.einsum("nd,nd->n", whitened, whitened)
         return result

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
 
+from uni4d_fg.arrays import BoolArray
 from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.optim.gtsam_graph import to_gtsam, variables_read
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
@@ -35,17 +37,29 @@ class StageGraph:
     @cached_property
     def initial(self) -> gtsam.Values:
         """Values before the solve."""
-        return self.initial_state.to_values(variables_read(self.problem, self.initial_state))
+        return self.initial_state.to_values(self._read)
 
     @cached_property
     def final(self) -> gtsam.Values:
         """Values after the solve."""
-        return self.final_state.to_values(variables_read(self.problem, self.final_state))
+        return self.final_state.to_values(self._read)
 
-    def values_text(self) -> dict[str, str]:
-        """Return files that ``gtsam.Values().deserialize`` reads: ``KIND.initial.values``, ``KIND.final.values``."""
-        ends = (("initial", self.initial), ("final", self.final))
-        return {f"{self.kind}.{name}.values": values.serialize() for name, values in ends}
+    @property
+    def num_variables(self) -> int:
+        """Number of variables that a factor reads."""
+        return sum(int(rows.sum()) for variable, rows in self._read.items() if variable in self.final_state)
+
+    def values_text(self) -> Iterator[tuple[str, str]]:
+        """Yield names and texts of files that ``gtsam.Values().deserialize`` reads, of both ends.
+
+        The names are ``KIND.initial.values`` and ``KIND.final.values``. Of what is yielded nothing is kept.
+        """
+        for end, state in (("initial", self.initial_state), ("final", self.final_state)):
+            yield f"{self.kind}.{end}.values", state.to_values(self._read).serialize()
+
+    @cached_property
+    def _read(self) -> dict[VariableType, BoolArray]:
+        return variables_read(self.problem, self.final_state)
 
 
 @dataclass
@@ -57,6 +71,7 @@ class RecordingRunner:
 
     def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
         """Solve a stage."""
+        self.solved.pop(stage.kind, None)  # not while another is made: of a long video each is hundreds of MB
         final, summary = self.run(stage, state, hooks)
         if stage.reads_free_variables:
             self.solved[stage.kind] = StageGraph(stage.kind, stage.problem, state, final)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 from uni4d_fg.files import atomic_write_text, remove_file
 from uni4d_fg.optim.problem_io import load_stage_graph
@@ -51,7 +52,7 @@ class GraphValues:
     text: dict[str, str]
     """By file name."""
     sizes: dict[str, dict[str, int]]
-    """How large the graphs are, by kind."""
+    """How many factors and variables the graphs have, by kind."""
 
     @classmethod
     def of(cls, folder: RunFolder) -> GraphValues:
@@ -60,14 +61,17 @@ class GraphValues:
         Raises:
             InputError: If one cannot be read.
         """
-        text: dict[str, str] = {}
-        sizes = {}
+        values = cls({}, {})
         for path in sorted(folder.graphs.glob("*.graph.npz")) if folder.graphs.is_dir() else ():
-            stage = load_stage_graph(path)
-            text |= stage.values_text()
-            factors = sum(len(batch) for batch in stage.problem.batches)
-            sizes[stage.kind] = {"factors": factors, "variables": int(stage.final.size())}
-        return cls(text, sizes)
+            values._add(path)
+        return values
+
+    def _add(self, path: Path) -> None:
+        # A function of its own, so that no two graphs are in memory: of a long video each is hundreds of MB.
+        stage = load_stage_graph(path)
+        self.text.update(stage.values_text())
+        factors = sum(len(batch) for batch in stage.problem.batches)
+        self.sizes[stage.kind] = {"factors": factors, "variables": stage.num_variables}
 
     def write(self, folder: RunFolder) -> None:
         """Write the files beside the graphs.

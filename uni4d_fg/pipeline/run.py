@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
@@ -75,6 +76,9 @@ from uni4d_fg.slam.windows.plan import Window, windows_of
 
 ValueT = TypeVar("ValueT")
 
+_MUCH = 256 << 20
+"""Bytes; more free memory than this is handed back before a step: the next one has arrays of other sizes."""
+
 
 @dataclass
 class _Run:
@@ -121,10 +125,12 @@ class _Run:
                 ),
                 should_stop=self.should_stop,
             )
+            return_free_memory(_MUCH)
             record = compute(hooks)
             for kind in kinds_of(name):
                 if kind in self.recorder.solved:
                     self.written.put(partial(save_stage_graph, self.folder.graph(kind), self.recorder.solved[kind]))
+            self.recorder.solved.clear()
             self.written.put(partial(self.store.save, name, key, record))
             self.reporter.end()
         self._note(name, record.summary, time.perf_counter() - began, resumed)
@@ -303,6 +309,7 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
     unit = "m" if summary.cues.get("metric", True) else "scale unknown"
+    return_free_memory(_MUCH)
     with ThreadPoolExecutor(1) as beside:
         # Clouds mostly wait for the disk.
         made = beside.submit(GraphValues.of, folder)

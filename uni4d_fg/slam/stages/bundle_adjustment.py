@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.stages import AccelerationConfig, BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import DegenerateProblemError
@@ -37,6 +38,9 @@ from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknow
 from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import drop_outliers, landmark_errors, measure_noise, spatial_inliers
 from uni4d_fg.slam.stages.terms import camera_motion_terms, intrinsics_priors
+
+_MUCH = 256 << 20
+"""Bytes; more free memory than this is handed back before a solve, of which a long video needs as much again."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +150,11 @@ def depth_prior_terms(
 ) -> list[FactorBatch]:
     """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales about one."""
     known = np.isfinite(observations.depth)
-    seen = observations.select(known)
+    frame = observations.frame[known]
     return [
         static_depth_prior(
-            seen.frame, row[known], seen.frame,
-            depth=seen.depth, sigma=sigma, weight=seen.weight, kernel=kernel_of(config.depth_kernel),
+            frame, row[known], frame, depth=observations.depth[known], sigma=sigma, weight=observations.weight[known],
+            kernel=kernel_of(config.depth_kernel),
         ),
         log_scale_prior(
             np.arange(num_frames), measured=np.full((num_frames, 1), log_scale), sigma=config.depth_scale_prior_sigma
@@ -219,6 +223,7 @@ def adjust_bundle(
 
     for index in range(rounds):
         problem = declare()
+        return_free_memory(_MUCH)
         if index == 1 and freedom.poses and motion.is_weak:
             motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
             problem = declare()
@@ -232,6 +237,7 @@ def adjust_bundle(
             state = hold_metric_scale(state)
         if index == rounds - 1 and energy.is_likelihood:
             covariances = _covariances(stage, state, observations, config, run)
+        del problem, stage  # as large as the observations, of which the next solve has others
         state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
             counts = ", ".join(f"{count} x {reason}" for reason, count in dropped.items() if count)
@@ -284,7 +290,9 @@ def refine_structure(
     solves = []
     for solver in (early(config.structure_solver), config.structure_solver):
         problem = structure_problem(state, observations, noise, config)
+        return_free_memory(_MUCH)
         state, summary = run(Stage(kind, problem, solver), state, hooks)
+        del problem
         solves.append(summary)
         noise = measure_noise(state, observations, noise, config)
     return state, noise, solves

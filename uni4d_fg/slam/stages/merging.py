@@ -27,23 +27,25 @@ itself, or the lowest track of its group. The tracks of a group are not seen in 
 class MergedTracks:
     """Which observation came from which track."""
 
-    observations: Observations
-    """Before the merge."""
+    track: IntArray
+    """(N,) of each observation before the merge."""
+    frame: IntArray
+    """(N,)."""
     point: IntArray
     """(N,) track that names the point of each observation."""
 
     @property
     def joined(self) -> int:
         """Number of tracks that became part of another."""
-        return len(np.unique(self.observations.track)) - len(np.unique(self.point))
+        return len(np.unique(self.track)) - len(np.unique(self.point))
 
     def split(self, scene: StaticScene) -> StaticScene:
         """Return the scene with the tracks' own names: one landmark per track, at its point."""
         seen = scene.observations
-        frames = 1 + int(self.observations.frame.max(initial=0))
-        key = self.point * frames + self.observations.frame
+        frames = 1 + int(self.frame.max(initial=0))
+        key = self.point * frames + self.frame
         order = np.argsort(key, kind="stable")
-        own = self.observations.track[order][np.searchsorted(key[order], seen.track * frames + seen.frame)]
+        own = self.track[order][np.searchsorted(key[order], seen.track * frames + seen.frame)]
         tracks, first = np.unique(own, return_index=True)
         landmark = np.searchsorted(scene.landmark_track, seen.track[first])
         seen = replace(seen, track=own)
@@ -65,9 +67,10 @@ def merge_tracks(state: State, observations: Observations, name: IntArray) -> tu
     weight = np.bincount(row, observations.weight, len(name)).astype(np.float64)
     points, group = np.unique(name, return_inverse=True)
     landmarks = mean_per_row(state[LANDMARK], weight, group, len(points))
-    renamed = replace(observations, track=name[row])
+    point = name[row]
+    renamed = replace(observations, track=point)
     merged = State({**state.arrays, LANDMARK: landmarks}, {**state.index, LANDMARK: points})
-    return merged, renamed.select(_order(renamed)), MergedTracks(observations, name[row])
+    return merged, renamed.select(_order(renamed)), MergedTracks(observations.track, observations.frame, point)
 
 
 def _order(observations: Observations) -> IntArray:

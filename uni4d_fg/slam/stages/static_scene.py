@@ -64,9 +64,8 @@ class StaticSceneSolver:
             DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
             SolverError: If the system is singular or a cue is not finite.
         """
-        observations = self._observations(labelled)
         return adjust_bundle(
-            observations, start, prior_intrinsics, self.config.bundle_adjustment, freedom,
+            self._observations(labelled), start, prior_intrinsics, self.config.bundle_adjustment, freedom,
             energy_of(self.config), self.hooks, self.run, self.find_fragments, self.timestamps,
         )  # fmt: skip
 
