@@ -1,6 +1,6 @@
 """Moving points of the paper's stage 3: the bare energy, its proximal term at several weights, and Adam.
 
-    python benchmarks/proximal.py [--scenes 12x1500 30x2000] [--weights 0 0.1 1 10] [--sequence FOLDER ...]
+    python benchmarks/proximal.py [--scenes 12x1500 30x2000] [--seeds 0] [--weights 0 0.1 1 10] [--sequence FOLDER ...]
 
 Every variant starts from the same stages 1 and 2 of `--config paper`. Errors are of the points in the camera of their
 frame against the scene's true ones, so that no alignment enters; of a sequence without true points, the median of
@@ -79,12 +79,14 @@ def compare(name: str, sequence: Sequence, weights: list[float], folder: Path) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", choices=SCENES, default=["12x1500", "30x2000"])
+    parser.add_argument("--seeds", nargs="*", type=int, default=[0])
     parser.add_argument("--weights", nargs="*", type=float, default=[0.0, 0.1, 1.0, 10.0])
     parser.add_argument("--sequence", nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, thread_limit(1):
         for name in arguments.scenes:
-            compare(name, scene(name), arguments.weights, Path(folder) / name)
+            for seed in arguments.seeds:
+                compare(f"{name} {seed}", scene(name, seed), arguments.weights, Path(folder) / f"{name}-{seed}")
         for path in arguments.sequence:
             compare(path.name, as_sequence(open_video(path)), arguments.weights, Path(folder) / path.name)
 

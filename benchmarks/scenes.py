@@ -15,9 +15,9 @@ SCENES = {
 PRESETS = ("default", "paper")
 
 
-def scene(name: str) -> Sequence:
+def scene(name: str, seed: int = 0) -> Sequence:
     """Return a scene with depth maps of 320 x 240, the default noise and flat gray images."""
     frames, columns, rows = SCENES[name]
     return make_synthetic_sequence(
-        SyntheticSceneConfig(num_frames=frames, grid_columns=columns, grid_rows=rows, render_images=False)
+        SyntheticSceneConfig(num_frames=frames, grid_columns=columns, grid_rows=rows, render_images=False, seed=seed)
     )

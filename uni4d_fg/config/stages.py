@@ -198,6 +198,13 @@ class NonRigidConfig(Section):
         "and with depth_kernel. Keeps a solver that goes to the minimum from shrinking the scene; Adam goes without.",
         ge=0,
     )
+    proximal_cg_tolerance: float = setting(
+        0.05,
+        "Replaces solver.cg_tolerance where that term holds the modes that shrink whole objects, for which the bare "
+        "energy needs a tighter one.",
+        gt=0,
+        lt=1,
+    )
     reprojection_sigma_px: float | None = setting(
         None, "Sigma of E_NR, px; null takes the one measured on the static scene.", gt=0, basic=True
     )

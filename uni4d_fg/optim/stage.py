@@ -58,13 +58,16 @@ class Stage:
     """Its world begins at a camera of its own, not at the video's first, and meters there may be others."""
     bounds: frozenset[str] = frozenset()
     """Names of terms that keep a solver which goes to the minimum near the start, and are no part of the energy."""
+    unbounded_solver: SolverConfig | None = None
+    """Solver options of the stage without its bounds, where they are others."""
 
     def unbounded(self) -> Stage:
         """Return the stage without its bounds: what a descent that stops early solves, and what is compared."""
         if not self.bounds:
             return self
         kept = tuple(batch for batch in self.problem.batches if batch.name not in self.bounds)
-        return replace(self, problem=replace(self.problem, batches=kept), bounds=frozenset())
+        solver = self.unbounded_solver or self.solver
+        return replace(self, problem=replace(self.problem, batches=kept), bounds=frozenset(), solver=solver)
 
     @property
     def name(self) -> str:

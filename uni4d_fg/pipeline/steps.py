@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
@@ -36,7 +36,7 @@ from uni4d_fg.slam.stages.local_scale import predict_log_scale
 from uni4d_fg.slam.stages.merging import FindFragments
 from uni4d_fg.slam.stages.nonrigid import solve_nonrigid
 from uni4d_fg.slam.stages.observations import Observations, observations_of
-from uni4d_fg.slam.stages.proximal import lift_noise
+from uni4d_fg.slam.stages.proximal import LiftNoise, lift_noise
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise, StaticScene
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 
@@ -239,6 +239,8 @@ def nonrigid_step(
     observations = observations_of(labelled, TrackLabel.DYNAMIC)
     cameras, noise = frozen_cameras(scene)
     observations, cameras, noise, facts = correct_cue(observations, labelled, cameras, noise, scene, config)
+    held, said = _noise_of_lift(labelled, cameras, scene, config)
+    facts += said
     result = solve_nonrigid(
         observations,
         labelled.instance.astype(np.int64),
@@ -248,6 +250,7 @@ def nonrigid_step(
         energy_of(config),
         hooks=hooks,
         run=run,
+        lift_noise=held,
     )
     solves = [] if result.solve is None else [result.solve]
     stop_if_cancelled(solves)
@@ -299,18 +302,9 @@ def correct_cue(
     config: Config,
 ) -> tuple[Observations, Cameras, StaticNoise, list[str]]:
     """Scale the cue at dynamic observations by what the static scene around them says."""
-    likely = energy_of(config).is_likelihood
-    if not (likely or config.nonrigid.proximal_weight > 0) or len(observations) == 0 or len(scene["landmarks"]) == 0:
+    if not energy_of(config).is_likelihood or len(observations) == 0 or len(scene["landmarks"]) == 0:
         return observations, cameras, noise, []
-    static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
-    static = static.select(np.isin(static.track, scene["landmark_track"]))
-    _, row = static.rows()
-    if not likely:
-        sigma = lift_noise(static, scene["landmarks"][row], cameras)
-        if not np.isfinite(sigma):
-            return observations, cameras, noise, []
-        noise = replace(noise, depth_sigma=max(sigma, config.bundle_adjustment.min_depth_sigma))
-        return observations, cameras, noise, [f"moving points held near their lift, noise {100 * sigma:.1f} %"]
+    static, row = _landmark_observations(labelled, scene)
     z = world_to_camera(cameras.world_T_cam[static.frame], scene["landmarks"][row])[:, 2]
     measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
     neighbors, samples = config.nonrigid.local_scale_neighbors, config.nonrigid.local_scale_samples
@@ -319,6 +313,27 @@ def correct_cue(
     observations = replace(observations, depth=observations.depth * np.exp(local.log_scale))
     noise = replace(noise, depth_sigma=max(local.sigma, config.bundle_adjustment.min_depth_sigma))
     return observations, replace(cameras, log_scale=np.zeros_like(cameras.log_scale)), noise, [fact]
+
+
+def _noise_of_lift(
+    labelled: LabelledTracks, cameras: Cameras, scene: Arrays, config: Config
+) -> tuple[LiftNoise | None, list[str]]:
+    """Measure what the proximal term of the paper's energy is in units of, if it is asked for."""
+    if config.nonrigid.proximal_weight == 0 or len(scene["landmarks"]) == 0:
+        return None, []
+    static, row = _landmark_observations(labelled, scene)
+    noise = lift_noise(static, scene["landmarks"][row], cameras)
+    if noise is None:
+        return None, []
+    fact = f"moving points held near their lift, noise {100 * noise.sigma:.1f} %"
+    return replace(noise, sigma=max(noise.sigma, config.bundle_adjustment.min_depth_sigma)), [fact]
+
+
+def _landmark_observations(labelled: LabelledTracks, scene: Arrays) -> tuple[Observations, IntArray]:
+    """Return all observations of the landmarks of a stage 2 record, and the landmark of each."""
+    static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
+    static = static.select(np.isin(static.track, scene["landmark_track"]))
+    return static, static.rows()[1]
 
 
 def frozen_cameras(scene: Arrays) -> tuple[Cameras, StaticNoise]:

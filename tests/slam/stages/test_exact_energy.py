@@ -25,7 +25,7 @@ from uni4d_fg.slam.stages.camera_init import PairSource, window_stage
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy
 from uni4d_fg.slam.stages.nonrigid import PointMesh, build_mesh, nonrigid_problem
 from uni4d_fg.slam.stages.observations import Observations, observations_of
-from uni4d_fg.slam.stages.proximal import proximal_term
+from uni4d_fg.slam.stages.proximal import LiftNoise, proximal_term
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
 
 FRAMES, TRACKS = 6, 15
@@ -282,7 +282,8 @@ def test_the_loss_of_adam_in_stage_3_is_the_formula_of_the_paper(
     state, mesh, observations, rows, cameras = dynamic
     energy = PaperEnergy(normalization)
     problem = nonrigid_problem(state, mesh, observations, rows, cameras, NOISE, PAPER_NONRIGID, energy)
-    bound = proximal_term(observations, rows, cameras, 0.02, NonRigidConfig(proximal_weight=1.0), energy)
+    lift_noise = LiftNoise(cameras.log_scale, 0.02)
+    bound = proximal_term(observations, rows, cameras, lift_noise, NonRigidConfig(proximal_weight=1.0), energy)
     stage = Stage("nonrigid", problem.add(bound), SolverConfig(), bounds=frozenset({bound.name}))
     seen = reprojection(state[DYNAMIC_POINT][rows], observations, cameras.world_T_cam, normalization)
     expected = seen + sum(point_motion(state, mesh, normalization))

@@ -18,7 +18,7 @@ from uni4d_fg.geometry.camera import camera_to_world, world_to_camera
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage
 from uni4d_fg.slam.stages.energy import PaperEnergy
-from uni4d_fg.slam.stages.proximal import lift_noise, proximal_term
+from uni4d_fg.slam.stages.proximal import LiftNoise, lift_noise, proximal_term
 from uni4d_fg.slam.stages.scene import Cameras
 
 FRAMES, TRACKS = 8, 60
@@ -47,7 +47,9 @@ def test_its_value_is_the_weighed_mean_of_the_departure_in_sigmas(
     local = world_to_camera(cameras.world_T_cam[observations.frame], landmarks[observations.rows()[1]])
     stretch = np.exp(rng.normal(scale=0.1, size=len(rows)))
     points = camera_to_world(cameras.world_T_cam[observations.frame], local * stretch[:, None])
-    term = proximal_term(observations, rows, cameras, 0.05, weighed(3.0), PaperEnergy(normalization))  # type: ignore[arg-type]
+    noise = LiftNoise(cameras.log_scale, 0.05)
+    energy = PaperEnergy(normalization)  # type: ignore[arg-type]
+    term = proximal_term(observations, rows, cameras, noise, weighed(3.0), energy)
     known = np.isfinite(depth)
     sigmas = np.abs(np.log(stretch) / 0.05)
     square = weight * np.where(sigmas <= 1.345, 0.5 * sigmas**2, 1.345 * (sigmas - 0.5 * 1.345))
@@ -74,16 +76,27 @@ def test_the_noise_of_the_lift_is_measured_whatever_the_outliers(cameras: Camera
     noise[rng.random(len(noise)) < 0.05] += 1.0
     depth = observations.depth * np.exp(noise - cameras.log_scale[observations.frame])
     observations = replace(observations, depth=depth)
-    assert lift_noise(observations, landmarks[observations.rows()[1]], cameras) == pytest.approx(0.03, rel=0.1)
+    of_observation = landmarks[observations.rows()[1]]
+    found = lift_noise(observations, of_observation, cameras)
+    assert found is not None
+    assert found.sigma == pytest.approx(0.03, rel=0.1)
+    np.testing.assert_allclose(found.log_scale, cameras.log_scale, atol=0.008)  # of some 300 points each, 5 % wrong
+    unseen = observations.select(observations.frame != 3)
+    there = lift_noise(unseen, landmarks[observations.rows()[1]][observations.frame != 3], cameras)
+    assert there is not None
+    assert there.log_scale[3] == 0.0
     nothing = replace(observations, depth=np.full(len(depth), np.nan))
-    assert np.isnan(lift_noise(nothing, landmarks[observations.rows()[1]], cameras))
+    assert lift_noise(nothing, of_observation, cameras) is None
 
 
 def test_a_stage_without_its_bounds_is_the_bare_energy(cameras: Cameras, rng: np.random.Generator) -> None:
     observations = static_observations(observe(static_points(rng, TRACKS), cameras.world_T_cam))
-    term = proximal_term(observations, np.arange(len(observations)), cameras, 0.05, weighed(1.0), PaperEnergy())
-    stage = Stage("nonrigid", Problem((term,)), SolverConfig(), bounds=frozenset({term.name}))
+    noise = LiftNoise(cameras.log_scale, 0.05)
+    term = proximal_term(observations, np.arange(len(observations)), cameras, noise, weighed(1.0), PaperEnergy())
+    exact = SolverConfig(cg_tolerance=1e-3)
+    stage = Stage("nonrigid", Problem((term,)), SolverConfig(), bounds=frozenset({term.name}), unbounded_solver=exact)
     assert stage.unbounded().problem.batches == ()
+    assert stage.unbounded().solver == exact
     assert stage.unbounded().unbounded() == stage.unbounded()
     assert len(stage.problem.batches) == 1
 

@@ -28,7 +28,7 @@ from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
 from uni4d_fg.slam.stages.lifting import lift
 from uni4d_fg.slam.stages.neighbors import nearest_neighbors
 from uni4d_fg.slam.stages.observations import Observations
-from uni4d_fg.slam.stages.proximal import proximal_term
+from uni4d_fg.slam.stages.proximal import LiftNoise, proximal_term
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise
 
 
@@ -226,6 +226,7 @@ def solve_nonrigid(
     energy: Energy = MAP,
     hooks: Hooks | None = None,
     run: StageRunner = run_stage,
+    lift_noise: LiftNoise | None = None,
 ) -> DynamicScene:
     """Run stage 3; without dynamic tracks the result is empty.
 
@@ -238,6 +239,7 @@ def solve_nonrigid(
         energy: Weighs the terms.
         hooks: Progress and cancellation.
         run: What solves the declared stage.
+        lift_noise: Of the proximal term; None takes the depth noise of ``noise`` and the cameras' scales.
 
     Raises:
         SolverError: If the system is singular or a cue is not finite.
@@ -250,10 +252,15 @@ def solve_nonrigid(
         return DynamicScene(empty[..., None] + np.zeros(3), empty > 0, mesh.track, mesh.instance, None, dropped)
     problem = nonrigid_problem(state, mesh, observations, rows, cameras, noise, config, energy)
     bounds: frozenset[str] = frozenset()
+    solver = config.solver
     if config.proximal_weight > 0:
-        bound = proximal_term(observations, rows, cameras, noise.depth_sigma, config, energy)
+        lift_noise = lift_noise or LiftNoise(cameras.log_scale, noise.depth_sigma)
+        bound = proximal_term(observations, rows, cameras, lift_noise, config, energy)
         problem, bounds = problem.add(bound), frozenset({bound.name})
-    stage = Stage("nonrigid", problem, config.solver, schedules=_schedules(config), bounds=bounds)
+        solver = solver.model_copy(update={"cg_tolerance": config.proximal_cg_tolerance})
+    stage = Stage(
+        "nonrigid", problem, solver, schedules=_schedules(config), bounds=bounds, unbounded_solver=config.solver
+    )
     state, summary = run(stage, state, hooks)
     points = np.full((*mesh.row.shape, 3), np.nan)
     points[mesh.row >= 0] = state[DYNAMIC_POINT]
