@@ -77,6 +77,12 @@ class GeometricDepthConfig(Section):
         "taken only where no other explains the tracks.",
     )  # fmt: skip
     retries: int = setting(1, "How often frames that fit badly are taken out and posed again.", ge=0)
+    trim_sigmas: float = setting(
+        2.5, "Cameras are refined from the tracks of which most observations agree within this many times the noise "
+        "of all, at most max_reprojection_px.", gt=0,
+    )  # fmt: skip
+    min_trim_px: float = setting(0.3, "The least such limit, px.", gt=0)
+    trim_rounds: int = setting(12, "How often the limit is lowered and cameras are refined, at most; 0 keeps it.", ge=0)
     epipolar_px: float = setting(
         1.0, "A track agrees with the epipolar geometry of most of the picture up to this distance, px.", gt=0
     )

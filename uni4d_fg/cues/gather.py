@@ -31,6 +31,9 @@ from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.optim.threads import on_one_blas_thread
 from uni4d_fg.progress import Reporter, SilentReporter
 
+_LESS_PARALLAX = 0.6
+"""By which factor less parallax is enough once some was seen: what moved is masked then, and had its share in it."""
+
 
 @on_one_blas_thread
 def gather_cues(
@@ -93,6 +96,8 @@ class _Gathering:
         self.intrinsics = video.intrinsics
         self.world_T_cam = video.initial_world_T_cam
         self.cameras_of_motion: FloatArray | None = None
+        self.moving_tracks: BoolArray | None = None
+        self.motion_has_parallax = False
         self.motion_facts: list[str] = []
         self.motion_warnings: list[str] = []
         self._video_key: str | None = None
@@ -208,13 +213,20 @@ class _Gathering:
         """Return depth up to scale: from camera motion alone, or a network's relative depth scaled by it."""
         tracks, video, report = self._any_tracks(), self.video, self.report
         static = np.ones(tracks.num_tracks, bool) if masks is None else static_tracks(tracks, masks)
+        config = self.config
+        if self.motion_has_parallax:
+            settings = config.geometric_depth
+            lower = settings.model_copy(update={"min_parallax_px": _LESS_PARALLAX * settings.min_parallax_px})
+            config = config.model_copy(update={"geometric_depth": lower})
         found = geometric_depth(
             replace(video, masks=masks), tracks, static, self._start_intrinsics(), self._key(), self.folder,
-            self.config, self.reporter, self.should_stop,
+            config, self.reporter, self.should_stop,
         )  # fmt: skip
         report.metric = False
         report.start = found.start
+        self.motion_has_parallax = found.has_parallax
         self.cameras_of_motion = found.world_T_cam
+        self.moving_tracks = found.moving
         self.intrinsics = found.intrinsics
         if video.intrinsics is None:
             report.sources["intrinsics"] = "from camera motion"
@@ -235,8 +247,8 @@ class _Gathering:
     def _motion_masks(self, depths: FrameSource[Float32Array]) -> FrameSource[Int32Array]:
         tracks = self._any_tracks()
         masks, facts, warnings = moving_masks(
-            self.video, depths, tracks, self._start_intrinsics(), self._key(), _name_of(depths), self.folder,
-            self.config, self.reporter, self.should_stop,
+            self.video, depths, tracks, self._start_intrinsics(), self._key(), _name_of(depths), self.moving_tracks,
+            self.folder, self.config, self.reporter, self.should_stop,
         )  # fmt: skip
         self.report.facts += [f"masks: {fact}" for fact in facts]
         self.report.warnings += warnings

@@ -52,6 +52,8 @@ class GeometricDepth:
     """(4,) px."""
     sparse: Float32Array
     """(K, T) depth of every static observation that is triangulated well, NaN elsewhere."""
+    moving: BoolArray
+    """(K,) tracks that contradict a static scene."""
     has_parallax: bool
     """False if the camera stays in one place, so that depth is a convention."""
     facts: tuple[str, ...]
@@ -156,7 +158,11 @@ def _with_maps(
     )
     warnings = (*start_doubts(structure, video.image_size, settings), *doubts)
     start = start_summary(structure)
-    return GeometricDepth(depths, structure.world_T_cam, structure.intrinsics, sparse, True, facts, warnings, start)
+    moving = np.zeros(tracks.num_tracks, dtype=bool)
+    moving[structure.track] = structure.moving
+    return GeometricDepth(
+        depths, structure.world_T_cam, structure.intrinsics, sparse, moving, True, facts, warnings, start
+    )
 
 
 def _normalize(structure: Structure, observations: Observations, median_depth: float) -> Structure:
@@ -285,7 +291,8 @@ def _without_parallax(
         f"{config.min_parallax_px:g} px), so depth cannot be seen: everything was put at distance "
         f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
     )
-    return GeometricDepth(depths, poses, intrinsics, sparse, False, ("no parallax",), warnings)
+    moving = np.zeros(tracks.num_tracks, dtype=bool)
+    return GeometricDepth(depths, poses, intrinsics, sparse, moving, False, ("no parallax",), warnings)
 
 
 def _on_sphere(uv: FloatArray, intrinsics: FloatArray, radius: float) -> FloatArray:

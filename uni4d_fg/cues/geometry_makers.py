@@ -76,7 +76,7 @@ def geometric_depth(
         # Written last: with it, the maps are complete.
         cache.put_arrays(
             _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
-            has_parallax=np.array([result.has_parallax]), said=np.array(said), **arrays,
+            moving=result.moving, has_parallax=np.array([result.has_parallax]), said=np.array(said), **arrays,
         )  # fmt: skip
         stored = _stored_structure(cache, tracks, leads_to_masks)
         assert stored is not None
@@ -88,8 +88,8 @@ def geometric_depth(
         depths = FloatMaps(tuple(cache.map_path(name) for name in names), video.image_size)
     return GeometricDepth(
         depths, stored["world_T_cam"], stored["intrinsics"],
-        stored["sparse"].astype(np.float32), bool(stored["has_parallax"][0]), tuple(facts), tuple(warnings),
-        start,
+        stored["sparse"].astype(np.float32), stored["moving"], bool(stored["has_parallax"][0]), tuple(facts),
+        tuple(warnings), start,
     )  # fmt: skip
 
 
@@ -103,7 +103,7 @@ def _grids(depths: FrameSource[Float32Array], reporter: Reporter, should_stop: S
 
 
 def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> dict[str, npt.NDArray[Any]] | None:
-    ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "has_parallax": 1, "said": None}
+    ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "moving": 1, "has_parallax": 1, "said": None}
     ranks |= {"grids": 3} if with_grids else {}
     stored = cache.arrays(_RECORD, ranks)
     return stored if stored is not None and stored["sparse"].shape == tracks.visible.shape else None
@@ -111,9 +111,9 @@ def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> di
 
 def moving_masks(
     video: Video, depths: FrameSource[Float32Array], tracks: Tracks, intrinsics: FloatArray, images_key: str,
-    depth_key: str, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
+    depth_key: str, moving: BoolArray | None, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
 ) -> tuple[MaskFolder, list[str], list[str]]:  # fmt: skip
-    """Find what moves, unless that is there already.
+    """Find what moves, unless that is there already; ``moving`` (K,) are tracks of which it is known.
 
     Returns:
         T maps of ids, facts and warnings.
@@ -125,7 +125,7 @@ def moving_masks(
     """
     key = maker_key(
         config.motion_masks, config.camera_init, config.bundle_adjustment, config.labels, config.input, images_key,
-        depth_key, _tracks_key(tracks), intrinsics.tolist(),
+        depth_key, _tracks_key(tracks), intrinsics.tolist(), "" if moving is None else _digest(moving),
     )  # fmt: skip
     target = folder / "masks" / f"motion-{key}"
     cache = FrameCache(target)
@@ -133,7 +133,7 @@ def moving_masks(
     if said is not None and labels_are_stored(target, video.num_frames, video.image_size):
         facts, warnings = json.loads(str(said["said"]))
         return open_labels(target, video.num_frames, video.image_size), facts, warnings
-    result = motion_masks(video, depths, tracks, intrinsics, config.motion_masks, reporter, should_stop, config)
+    result = motion_masks(video, depths, tracks, intrinsics, config.motion_masks, reporter, should_stop, config, moving)
     cache.put_arrays("said", said=np.array(json.dumps([result.facts, result.warnings])))
     masks = store_labels(iter(result.labels), video.num_frames, video.image_size, target, "masks to disk", reporter)
     return masks, list(result.facts), list(result.warnings)

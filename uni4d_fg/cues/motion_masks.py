@@ -70,6 +70,7 @@ def motion_masks(
     reporter: Reporter | None = None,
     should_stop: Callable[[], bool] | None = None,
     solver: Config | None = None,
+    known_moving: BoolArray | None = None,
 ) -> MotionMasks:
     """Find what moves in a video by comparing it with a static scene.
 
@@ -82,6 +83,7 @@ def motion_masks(
         reporter: Progress.
         should_stop: Polled often.
         solver: Stages 1 and 2 and their minimizer; None takes the defaults.
+        known_moving: (K,) tracks that are known to move, if any are.
 
     Raises:
         InputError: If depth or tracks do not fit the images, or depth is missing wherever there is a track.
@@ -95,7 +97,9 @@ def motion_masks(
             raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
     report.begin("motion of tracks", config.camera_rounds)
-    cameras, motion = _tracks_and_cameras(video, depths, tracks, intrinsics, config, settings, report, stop)
+    cameras, motion = _tracks_and_cameras(
+        video, depths, tracks, intrinsics, known_moving, config, settings, report, stop
+    )
     report.end()
     report.begin("motion masks", video.num_frames)
     comparison = _Comparison(video, depths, tracks, cameras, motion, config)
@@ -136,6 +140,7 @@ def _tracks_and_cameras(
     depths: FrameSource[Float32Array],
     tracks: Tracks,
     intrinsics: FloatArray,
+    known_moving: BoolArray | None,
     config: MotionMaskConfig,
     settings: Config,
     report: Reporter,
@@ -149,7 +154,10 @@ def _tracks_and_cameras(
             "or let it come from the motion of the camera"
         )
     spread = spread_at_tracks(known.labelled.tracks, depths, max(1, round(config.depth_edge_px)))
-    outlier = moving = find_outlier_tracks(known.labelled, intrinsics, config)
+    outlier = find_outlier_tracks(known.labelled, intrinsics, config)
+    if known_moving is not None:
+        outlier = outlier | known_moving
+    moving = outlier
     cameras, motion = None, None
     for turn in range(config.camera_rounds):
         cameras = solve_cameras(

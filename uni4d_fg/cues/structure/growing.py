@@ -51,6 +51,10 @@ class GrowingScene:
     free_focal: bool
     prior_intrinsics: FloatArray
     should_stop: Callable[[], bool]
+    limit_px: FloatArray
+    """(T,) Up to this reprojection error an observation of a frame agrees with its point."""
+    left_out: BoolArray
+    """(M,) tracks that take no part in bundle adjustment."""
     sigma_px: float | None = None
     """Noise of the tracks, where it was measured; the configured one before."""
 
@@ -72,6 +76,7 @@ class GrowingScene:
             observations, row, len(tracks), intrinsics.copy(), np.tile(np.eye(4), (num_frames, 1, 1)),
             np.zeros(num_frames, dtype=bool), np.full((len(tracks), 3), np.nan),
             np.zeros(len(observations), dtype=bool), config, free_focal, prior_intrinsics, should_stop,
+            np.full(num_frames, config.geometric_depth.max_reprojection_px), np.zeros(len(tracks), dtype=bool),
         )  # fmt: skip
 
     def start(self, pair: FramePair) -> int:
@@ -145,6 +150,15 @@ class GrowingScene:
         fits = sound(points, settings.max_reprojection_px, settings.min_angle_deg)
         self.position[rows] = np.where(fits[:, None], points.position, np.nan)
         self._judge(None if posed is None else np.flatnonzero(which[self.row] | (self.observations.frame == posed)))
+
+    def triangulate_all(self) -> None:
+        """Triangulate all tracks anew, those that are left out as well."""
+        self.triangulate(np.ones(self.num_tracks, dtype=bool))
+
+    def leave_out(self, tracks: BoolArray, limit_px: FloatArray) -> None:
+        """Let tracks (M,) take no part in bundle adjustment, nor what is beyond limits (T,), px; points stay."""
+        self.left_out, self.limit_px = tracks, limit_px
+        self.good = self._agrees(None)
 
     def adjust(self, relative_decrease: float | None = None) -> None:
         """Refine all cameras, points and (from three frames on) the focal lengths; then judge all observations.
@@ -238,14 +252,20 @@ class GrowingScene:
 
     def _judge(self, changed: IntArray | None = None) -> None:
         """Tell which observations agree with their point, of all or of those (n,) for which it may have changed."""
-        limit = self.config.geometric_depth.max_reprojection_px
         if changed is None:
-            self.good = self.registered[self.observations.frame] & (self.errors() <= limit)
+            self.good = self._agrees(None)
         else:
-            self.good[changed] = self.registered[self.observations.frame[changed]] & (self.errors(changed) <= limit)
+            self.good[changed] = self._agrees(changed)
         # A point that fewer than two observations hold is none.
         held = np.bincount(self.row[self.good], minlength=self.num_tracks) >= 2
-        self.position[~held] = np.nan
+        self.position[~held & ~self.left_out] = np.nan
+
+    def _agrees(self, some: IntArray | None) -> BoolArray:
+        """Return which of some observations (n,), None for all, are within the limit, of tracks that take part."""
+        frame, row = self.observations.frame, self.row
+        if some is not None:
+            frame, row = frame[some], row[some]
+        return self.registered[frame] & (self.errors(some) <= self.limit_px[frame]) & ~self.left_out[row]
 
     def _forget_flat(self) -> None:
         """Forget points that bundle adjustment has moved to where their rays are parallel."""

@@ -19,6 +19,7 @@ from uni4d_fg.cues.structure.hypotheses import Competition
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
+from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.progress import Reporter
@@ -39,6 +40,8 @@ class Structure:
     """(M,) tracks that were triangulated."""
     points: Points
     """M points, NaN where a track cannot be triangulated."""
+    moving: BoolArray
+    """(M,) tracks that contradict a static point: half of their errors are beyond the limit for tracks."""
     sigma_px: float
     """Noise of the tracks (robust standard deviation of a reprojection residual)."""
     pair: FramePair
@@ -100,12 +103,13 @@ def structure_from_motion(
     )  # fmt: skip
     scene.continue_from(best.scene)
     grow(scene, reporter)
+    trim(scene)
     reporter.begin("focal lengths", None)
     scene.measure_noise()
     scene.adjust(CONVERGED)
     sigma = scene.measure_noise()
     poses = _bridge(scene.world_T_cam, scene.registered)
-    track, points = _triangulate_all(observations, poses, scene)
+    track, points, moving = _triangulate_all(observations, poses, scene)
     mean_focal = float(np.mean(scene.intrinsics[:2]))
     rivals, focal = list[Rival](), FocalInterval(mean_focal, mean_focal)
     if with_doubts:
@@ -116,7 +120,8 @@ def structure_from_motion(
             focal = focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
     reporter.end()
     return Structure(
-        poses, scene.intrinsics, scene.registered, track, points, sigma, best.pair, focal, best.unexplained, rivals
+        poses, scene.intrinsics, scene.registered, track, points, moving, sigma, best.pair, focal, best.unexplained,
+        rivals,
     )  # fmt: skip
 
 
@@ -145,19 +150,21 @@ def _bridge(world_T_cam: FloatArray, registered: BoolArray) -> FloatArray:
     return out
 
 
-def _triangulate_all(observations: Observations, poses: FloatArray, scene: GrowingScene) -> tuple[IntArray, Points]:
+def _triangulate_all(
+    observations: Observations, poses: FloatArray, scene: GrowingScene
+) -> tuple[IntArray, Points, BoolArray]:
     """Triangulate every track from the frames with a pose, twice: the second time without what did not fit."""
     observations = observations.select(scene.registered[observations.frame])
     tracks, row = observations.rows()
-    settings = scene.config.geometric_depth
-    limit, huber_px = settings.max_reprojection_px, settings.triangulation_huber_px
+    limit, huber_px = float(np.median(scene.limit_px)), scene.config.geometric_depth.triangulation_huber_px
     rays = RayBundle(row, poses, observations.frame, observations.uv, scene.intrinsics, len(tracks))
     points = triangulate(rays, huber_px)
     with np.errstate(invalid="ignore"):
-        fits = points.errors_of(rays) <= limit
+        fits = points.errors_of(rays) <= scene.limit_px[observations.frame]
+        moving = points.error_px > limit
     again = np.bincount(row, ~fits, len(tracks)) > 0
     points = points.replaced(again, triangulate(rays.select(fits & again[row]), huber_px))
     with np.errstate(invalid="ignore"):
         wrong = ~(points.error_px <= limit)
-    points.position[wrong] = np.nan
-    return tracks, points
+    points.position[wrong | moving] = np.nan
+    return tracks, points, moving

@@ -1,0 +1,85 @@
+"""What most tracks agree on, refined alone: the limit up to which a track agrees follows the noise that is left.
+
+A thing that moves by little between frames, or along its epipolar lines, passes limits of pixels, and a convex kernel
+lets it bend the cameras. Its tracks depart from a rigid scene more than the others all the same. So the limit is
+lowered with the median residual, tracks are judged, and bundle adjustment is repeated with those that agree, until the
+limit stays: least trimmed squares (P. Rousseeuw, "Least median of squares regression", 1984), for which more than half
+of the observations must be of what stands still. Tracks that were left out are triangulated and judged again in every
+round. The limit is low, so that the cameras come loose from what bends them; in the end it is doubled, and tracks
+that agree within that come back: those that a lens or a rolling shutter displaces a little are not to be missed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.cues.structure.growing import GrowingScene
+
+_MEDIAN_OF_NORM = 1.1774
+"""Median length of a plane vector with normal components of variance 1."""
+_SETTLED = 0.03
+"""Relative change of the limit at which it stays."""
+_WIDEN = 2.0
+"""What the limit is multiplied by in the end."""
+_MOST = 0.5
+"""A track of which more than this part of the observations is beyond the limit does not agree."""
+
+
+def trim(scene: GrowingScene) -> None:
+    """Refine a grown scene from the tracks that agree with it within a limit that follows their noise.
+
+    Afterwards ``scene.limit_px`` is that limit, and ``scene.left_out`` (M,) the tracks that do not agree.
+
+    Args:
+        scene: Grown.
+
+    Raises:
+        Cancelled: If asked to stop.
+        SolverError: If bundle adjustment fails.
+    """
+    settings = scene.config.geometric_depth
+    limit = scene.limit_px
+    for _ in range(settings.trim_rounds):
+        noise, before = _noise(scene), limit
+        limit = np.clip(settings.trim_sigmas * noise, settings.min_trim_px, settings.max_reprojection_px)
+        left_out = _disagreeing(scene, limit)
+        settled = float(np.abs(np.log(limit / before)).max()) < _SETTLED and not (left_out & ~scene.left_out).any()
+        scene.leave_out(left_out, limit)
+        if settled:
+            break
+        scene.measure_noise()
+        scene.adjust()
+        scene.triangulate_all()
+    limit = np.minimum(_WIDEN * limit, settings.max_reprojection_px)
+    scene.leave_out(_disagreeing(scene, limit), limit)
+
+
+def _seen(scene: GrowingScene) -> tuple[FloatArray, BoolArray]:
+    """Return the error (N,) px of every observation, and which have a point and a camera."""
+    error = scene.errors()
+    return error, scene.registered[scene.observations.frame] & np.isfinite(error)
+
+
+def _noise(scene: GrowingScene) -> FloatArray:
+    """Return the noise of a component of the observations in each frame (T,), px, by medians.
+
+    That of all observations, or of a frame that has more: what is blurred or turned fast is not to lose its camera.
+    """
+    error, seen = _seen(scene)
+    frame = scene.observations.frame
+    if not seen.any():
+        return np.zeros(len(scene.registered))
+    every = float(np.median(error[seen]))
+    own = np.full(len(scene.registered), every)
+    for t in np.unique(frame[seen]).tolist():
+        own[t] = np.median(error[seen & (frame == t)])
+    return np.asarray(np.maximum(own, every) / _MEDIAN_OF_NORM)
+
+
+def _disagreeing(scene: GrowingScene, limit_px: FloatArray) -> BoolArray:
+    """Return the tracks (M,) of which most observations are beyond the limits (T,)."""
+    error, seen = _seen(scene)
+    count = np.bincount(scene.row[seen], minlength=scene.num_tracks)
+    beyond = np.bincount(scene.row[seen], (error > limit_px[scene.observations.frame])[seen], scene.num_tracks)
+    return np.asarray(beyond > _MOST * count)
