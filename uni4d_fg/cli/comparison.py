@@ -52,12 +52,14 @@ def compare(
 ) -> None:
     """Compare Levenberg-Marquardt with the Adam baseline (needs the extra 'adam'), stage by stage."""
     from uni4d_fg.config.load import load_config
+    from uni4d_fg.optional import import_torch
     from uni4d_fg.pipeline.compare.comparison import Budget, Comparison, compare_sequence
     from uni4d_fg.pipeline.compare.machine import machine
     from uni4d_fg.pipeline.compare.markdown import section
     from uni4d_fg.pipeline.compare.report import draw_comparison, write_report
     from uni4d_fg.pipeline.compare.solvers import solver_variants
 
+    import_torch()  # one side of every comparison: said before minutes are spent on the other
     described = machine()
     solvers = solver_variants(variants or [])
     configs = {
