@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -203,6 +204,7 @@ def _experiment(
     work: WorkerOptions,
 ) -> None:
     from uni4d_fg.pipeline.benchmark.methods import read_method
+    from uni4d_fg.pipeline.benchmark.prepare import masks_of_run
     from uni4d_fg.pipeline.benchmark.published import read_published
     from uni4d_fg.pipeline.benchmark.report import Facts, draw_pictures, write_tables
     from uni4d_fg.pipeline.benchmark.runner import run_tasks
@@ -236,7 +238,9 @@ def _experiment(
         except Cancelled as error:
             raise Cancelled(f"finished videos are kept in {out}; the same command goes on from them") from error
         methods = [Method(row.name, {v: found[row.name][v] for v in wanted if v in found[row.name]}) for row in rows]
-        methods += [read_method(text, dataset, root, wanted, poses, depths) for text in read or ()]
+        # What others wrote is scored with the masks of the first row's runs.
+        masks = cache(lambda task: masks_of_run(task, reporter, stop))
+        methods += [read_method(text, tasks[: len(wanted)], masks) for text in read or ()]
         printed = read_published() if published else []
         tables = all_tables(name, dataset.card.title, methods, poses, depths, printed)
         page = write_tables(out, facts, tables, methods)

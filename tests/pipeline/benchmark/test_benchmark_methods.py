@@ -20,6 +20,7 @@ from uni4d_fg.pipeline.benchmark.methods.exr import read_exr
 from uni4d_fg.pipeline.benchmark.methods.files import poses_of_rows
 from uni4d_fg.pipeline.benchmark.methods.layouts import LAYOUTS
 from uni4d_fg.pipeline.benchmark.score import score_estimate
+from uni4d_fg.pipeline.benchmark.task import Configuration, Task
 
 FRAMES, SIZE = 5, (12, 16)
 MATRIX = np.array([[20.0, 0.0, 7.5], [0.0, 21.0, 5.5], [0.0, 0.0, 1.0]])
@@ -225,7 +226,5 @@ def test_a_missing_frame_is_an_error(layout: str, damage: str, video: Video, tmp
 
 @pytest.mark.parametrize("text", ["monst3r", "nosuch=/x", "monst3r:a=", ":=x"])
 def test_a_wrong_option_is_explained(text: str, tmp_path: Path) -> None:
-    from uni4d_fg.frontend.datasets.registry import find_dataset
-
     with pytest.raises(ConfigError, match="LAYOUT:NAME=FOLDER"):
-        read_method(text, find_dataset("sintel"), tmp_path, ("v",), ("sim3",), ())
+        read_method(text, [Task("sintel", str(tmp_path), "v", Configuration("x"), str(tmp_path))])

@@ -6,18 +6,13 @@ import csv
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from benchmark_scenes import synthesize
 
 pytest.importorskip("open3d")
 
-Run = Callable[..., tuple[int, str, str]]
-SCENE = [
-    "--frames", "7", "--width", "80", "--height", "60", "--set", "focal=75", "--set", "grid_columns=14",
-    "--set", "grid_rows=10", "--set", "query_interval=4", "--set", "margin_px=3", "--quiet",
-]  # fmt: skip
 PLAIN = [
     "--set",
     "output.clouds=false",
@@ -48,13 +43,8 @@ print([run(words) for words in json.loads(sys.argv[1])])
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two videos of Sintel."""
-    from uni4d_fg.cli import main
-
     folder = tmp_path_factory.mktemp("sintel")
-    for seed, video in enumerate(("alley_2", "ambush_4")):
-        assert (
-            main.run(["synthesize", str(folder), "--as", "sintel", "--video", video, "--seed", str(seed), *SCENE]) == 0
-        )
+    synthesize(folder, "sintel", "alley_2", "ambush_4")
     return folder
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_scenes import CONFIG, sintel_task, synthesize
 
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.datasets import synthetic
@@ -21,36 +22,21 @@ from uni4d_fg.pipeline.benchmark import runner
 from uni4d_fg.pipeline.benchmark.prepare import open_task, prepare, with_cues
 from uni4d_fg.pipeline.benchmark.runner import one_after_the_other, run_task, run_tasks
 from uni4d_fg.pipeline.benchmark.score import Estimate, score_estimate
-from uni4d_fg.pipeline.benchmark.task import Configuration, Task, TaskResult
+from uni4d_fg.pipeline.benchmark.task import Task, TaskResult
 from uni4d_fg.results.evaluate.run import evaluate_run
 
 pytest.importorskip("open3d")
 
 Run = Callable[..., tuple[int, str, str]]
-SCENE = [
-    "--frames", "7", "--width", "80", "--height", "60", "--set", "focal=75", "--set", "grid_columns=14",
-    "--set", "grid_rows=10", "--set", "query_interval=4", "--set", "margin_px=3", "--quiet",
-]  # fmt: skip
-CONFIG = ("output.clouds=false", "output.pictures=false")
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two videos of Sintel, and one without its depth."""
-    from uni4d_fg.cli import main
-
     folder = tmp_path_factory.mktemp("sintel")
-    for seed, video in enumerate(("alley_2", "ambush_4", "cave_2")):
-        assert (
-            main.run(["synthesize", str(folder), "--as", "sintel", "--video", video, "--seed", str(seed), *SCENE]) == 0
-        )
+    synthesize(folder, "sintel", "alley_2", "ambush_4", "cave_2")
     shutil.rmtree(folder / "training" / "depth" / "cave_2")
     return folder
-
-
-def task(root: Path, out: Path, **changes: object) -> Task:
-    ways = Configuration("fast", "fast", CONFIG, **changes)  # type: ignore[arg-type]
-    return Task("sintel", str(root), "alley_2", ways, str(out), str(root / "cues"), None, ("sim3",), ("uni4d-scale",))
 
 
 def test_one_command_runs_and_scores_a_dataset(root: Path, cli: Run, tmp_path: Path) -> None:
@@ -109,7 +95,7 @@ def test_a_video_that_fails_does_not_stop_the_others(
         raise ZeroDivisionError("no such thing")
 
     monkeypatch.setattr(runner, "reconstruct", broken)
-    tasks = [task(root, tmp_path), replace(task(root, tmp_path), video="nosuch")]
+    tasks = [sintel_task(root, tmp_path), replace(sintel_task(root, tmp_path), video="nosuch")]
     found = [result for result, _ in run_tasks(tasks, one_after_the_other())]
     assert found[0].failed == "unexpected ZeroDivisionError: no such thing"
     assert found[1].failed is not None
@@ -118,7 +104,7 @@ def test_a_video_that_fails_does_not_stop_the_others(
 
 
 def test_any_executor_can_do_the_tasks_and_gets_only_what_is_missing(root: Path, tmp_path: Path) -> None:
-    tasks = [replace(task(root, tmp_path), video=video) for video in ("a", "b", "c")]
+    tasks = [replace(sintel_task(root, tmp_path), video=video) for video in ("a", "b", "c")]
     TaskResult(tasks[1].key, "b", "fast").save(tasks[1].result_file)
     asked: list[str] = []
 
@@ -133,30 +119,30 @@ def test_any_executor_can_do_the_tasks_and_gets_only_what_is_missing(root: Path,
 
 
 def test_a_cancelled_task_leaves_no_result(root: Path, tmp_path: Path) -> None:
-    one = task(root, tmp_path)
+    one = sintel_task(root, tmp_path)
     with pytest.raises(Cancelled):
         run_task(one, should_stop=lambda: True)
     assert not one.result_file.exists()
 
 
 def test_what_a_configuration_says_is_what_is_solved(root: Path, tmp_path: Path) -> None:
-    plain = prepare(task(root, tmp_path))
+    plain = prepare(sintel_task(root, tmp_path))
     truth = plain.video.ground_truth
     assert truth.masks is not None
     assert plain.config.input.intrinsics == "free"
-    known = prepare(task(root, tmp_path, intrinsics="known", masks="true", poses="identity"))
+    known = prepare(sintel_task(root, tmp_path, intrinsics="known", masks="true", poses="identity"))
     assert known.config.input.intrinsics == "fixed"
     assert known.config.input.poses == "initial"
     np.testing.assert_array_equal(known.sequence.intrinsics, truth.intrinsics)
     np.testing.assert_array_equal(known.sequence.masks[3], truth.masks[3])
     np.testing.assert_array_equal(known.sequence.initial_world_T_cam, np.tile(np.eye(4), (7, 1, 1)))
-    assert prepare(task(root, tmp_path, tracks="built_in")).sequence.tracks is None
-    static = prepare(task(root, tmp_path, masks="none"))
+    assert prepare(sintel_task(root, tmp_path, tracks="built_in")).sequence.tracks is None
+    static = prepare(sintel_task(root, tmp_path, masks="none"))
     assert not any(mask.any() for mask in static.sequence.masks)
-    small = prepare(replace(task(root, tmp_path), max_size=40))
+    small = prepare(replace(sintel_task(root, tmp_path), max_size=40))
     assert small.sequence.image_size == (30, 40)
     assert small.video.image_size == (60, 80)
-    kitti = replace(task(root, tmp_path), dataset="sintel-clean")
+    kitti = replace(sintel_task(root, tmp_path), dataset="sintel-clean")
     assert open_task(kitti).depths is not None
 
 

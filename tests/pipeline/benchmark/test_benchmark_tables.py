@@ -14,7 +14,7 @@ from uni4d_fg.pipeline.benchmark.published import read_published
 from uni4d_fg.pipeline.benchmark.short import short_table
 from uni4d_fg.pipeline.benchmark.table import Column, Row, Table, latex_text
 from uni4d_fg.pipeline.benchmark.tables import Method, all_tables
-from uni4d_fg.pipeline.benchmark.task import Configuration, Task, TaskResult, stored_result
+from uni4d_fg.pipeline.benchmark.task import RESULT_VERSION, Configuration, Task, TaskResult, stored_result
 
 
 def depth_scores(abs_rel: float, pixels: int) -> dict[str, object]:
@@ -137,7 +137,7 @@ def test_the_papers_ablations_are_valid() -> None:
     assert len(configurations(list(PAPER.items()), {}, "ablate")) == len(PAPER)
 
 
-def test_a_stored_result_counts_only_for_its_own_task(tmp_path: Path) -> None:
+def test_a_stored_result_counts_only_for_its_own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Task("sintel", "root", "a", Configuration("x"), str(tmp_path))
     assert stored_result(task) is None
     TaskResult(task.key, "a", "x", notes=("n",)).save(task.result_file)
@@ -146,6 +146,9 @@ def test_a_stored_result_counts_only_for_its_own_task(tmp_path: Path) -> None:
     assert found.notes == ("n",)
     other = Task("sintel", "root", "a", Configuration("x", changes=("solver=adam",)), str(tmp_path))
     assert stored_result(other) is None
+    with monkeypatch.context() as patch:
+        patch.setattr("uni4d_fg.pipeline.benchmark.task.RESULT_VERSION", RESULT_VERSION - 1)
+        assert stored_result(task) is None  # scores of another version came out otherwise
     TaskResult(task.key, "a", "x", failed="why").save(task.result_file)
     assert stored_result(task) is None
     task.result_file.write_text("{")

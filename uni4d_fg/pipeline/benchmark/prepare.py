@@ -9,21 +9,27 @@ from typing import Any
 
 import numpy as np
 
+from uni4d_fg.arrays import Int32Array
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import settings_for_depth
 from uni4d_fg.cues.gather import gather_cues
-from uni4d_fg.cues.plan import plan_cues
-from uni4d_fg.errors import InputError
+from uni4d_fg.cues.plan import MaskSource, plan_cues
+from uni4d_fg.errors import Cancelled, InputError, Uni4dFgError
 from uni4d_fg.frontend.datasets.registry import find_dataset
 from uni4d_fg.frontend.sequence.assemble import as_sequence, check_count, load_tracks, open_depth, open_masks
 from uni4d_fg.frontend.sequence.calibration import load_intrinsics
-from uni4d_fg.frontend.sequence.model import Sequence, Video
+from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.sequence.native import find_native_files
 from uni4d_fg.frontend.sequence.resize import resize_video
 from uni4d_fg.frontend.sequence.uni4d_layout import find_uni4d_files, has_uni4d_cues
+from uni4d_fg.pipeline.benchmark.score import NO_MASKS
 from uni4d_fg.pipeline.benchmark.task import Task
 from uni4d_fg.progress import Reporter, SilentReporter
+
+_MASK_SOURCES: dict[MaskSource, str] = {
+    "given": "by masks of the cues", "card": "by masks of a network", "motion": "by masks from motion", "none": NO_MASKS
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,8 @@ class Prepared:
     config: Config
     cues: dict[str, Any] | None
     """What was made of the cues, for the summary."""
+    mask_source: str
+    """Which pixels of the sequence are static, in words for tables: by whose masks."""
 
 
 def open_task(task: Task) -> Video:
@@ -104,12 +112,33 @@ def prepare(task: Task, reporter: Reporter | None = None, should_stop: Callable[
     config = load_config(chosen.preset, changes)
     made = chosen.masks if chosen.masks in ("motion", "none") else None
     plan = plan_cues(used, bare=used.depths is None, masks=made)
+    source = "by true masks" if chosen.masks == "true" else _MASK_SOURCES[plan.masks]
     if plan.is_given:
         sequence = as_sequence(replace(used, masks=None) if made == "none" else used)
-        return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), None)
+        return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), None, source)
     plan.check()
     sequence, report = gather_cues(
         used, plan, task.run_folder / "cues", config, reporter=reporter or SilentReporter(), should_stop=should_stop,
         track_cache=task.run_folder / "stages",
     )  # fmt: skip
-    return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), report.to_dict())
+    return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), report.to_dict(), source)
+
+
+def masks_of_run(
+    task: Task, reporter: Reporter | None = None, should_stop: Callable[[], bool] | None = None
+) -> tuple[FrameSource[Int32Array] | None, str]:
+    """Return the masks that the run of a task takes, and in words, by whose masks pixels are static.
+
+    What the run made of the video is read from its folder, or made again; where that fails, as the run did, there are
+    no masks.
+
+    Raises:
+        Cancelled: If ``should_stop`` turned true.
+    """
+    try:
+        prepared = prepare(task, reporter, should_stop)
+    except Cancelled:
+        raise
+    except Uni4dFgError:
+        return None, NO_MASKS
+    return prepared.sequence.masks, prepared.mask_source

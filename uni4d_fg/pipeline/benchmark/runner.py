@@ -11,7 +11,7 @@ from uni4d_fg.errors import Cancelled, Uni4dFgError
 from uni4d_fg.frontend.datasets.registry import find_dataset
 from uni4d_fg.optim.threads import thread_limit
 from uni4d_fg.pipeline.benchmark.prepare import prepare
-from uni4d_fg.pipeline.benchmark.score import Estimate, estimate_of_run, poses_of_stages, score_estimate
+from uni4d_fg.pipeline.benchmark.score import Estimate, estimates_of_run, poses_of_stages, score_estimate
 from uni4d_fg.pipeline.benchmark.task import Task, TaskResult, stored_result
 from uni4d_fg.pipeline.run import reconstruct
 from uni4d_fg.progress import Reporter, SilentReporter
@@ -85,11 +85,10 @@ def _done(task: Task, reporter: Reporter, should_stop: Callable[[], bool]) -> Ta
         cues=prepared.cues,
     )  # fmt: skip
     sequence, video = prepared.sequence, prepared.video
-    estimate = estimate_of_run(task.run_folder, sequence)
-    protocols = task.pose_protocols, task.depth_protocols
-    scores = score_estimate(video, estimate, task.dataset, *protocols, sequence.masks)
-    cue = Estimate(estimate.world_T_cam, sequence.depths, estimate.intrinsics, estimate.lens)
-    scores["depth_cue"] = score_estimate(video, cue, task.dataset, (), protocols[1], sequence.masks)
+    estimate, cue = estimates_of_run(task.run_folder, sequence)
+    protocols, masks = (task.pose_protocols, task.depth_protocols), (sequence.masks, prepared.mask_source)
+    scores = score_estimate(video, estimate, task.dataset, *protocols, *masks)
+    scores["depth_cue"] = score_estimate(video, cue, task.dataset, (), protocols[1], *masks)
     scores["stages"] = {
         stage: score_estimate(video, Estimate(poses), task.dataset, protocols[0], ())
         for stage, poses in poses_of_stages(task.run_folder).items()

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
-from uni4d_fg.frontend.sequence.frames import no_masks
+from uni4d_fg.frontend.sequence.frames import ChangedFrames, no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
+from uni4d_fg.frontend.sequence.resize import resize_nearest
 from uni4d_fg.geometry.alignment import align_trajectories
 from uni4d_fg.geometry.camera import camera_to_world, world_to_camera
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.pipeline.store import StageStore
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.evaluate.points import evaluate_points
-from uni4d_fg.results.evaluate.protocols.consistency import score_consistency
+from uni4d_fg.results.evaluate.protocols.consistency import ConsistencyScore, score_consistency
 from uni4d_fg.results.evaluate.protocols.depth import DEPTH_PROTOCOLS, score_depth
 from uni4d_fg.results.evaluate.protocols.pose import POSE_PROTOCOLS, score_poses
 from uni4d_fg.results.evaluate.protocols.tracks3d import score_tracks
@@ -28,6 +30,7 @@ from uni4d_fg.slam.reconstruction import Reconstruction
 _STILL_M = 0.002
 """A point that moves by less in the whole video is static."""
 POINT_PROTOCOL = "observed, aligned by Sim(3) Umeyama of the cameras"
+NO_MASKS = "all, without masks"
 
 
 @dataclass(frozen=True)
@@ -39,10 +42,20 @@ class Estimate:
     depths: FrameSource[Float32Array] | None = None
     """T maps of any size."""
     intrinsics: FloatArray | None = None
-    """(4,) px, of images of the size of ``depths``."""
+    """(4,), or (T, 4) where the camera zooms, px, of images of the size of ``depths``."""
     lens: Lens = PINHOLE
+    log_scale: FloatArray | None = None
+    """(T,) logarithm of a factor on each frame's depth, with which it agrees with the cameras; for self-consistency
+    alone, as depth by the protocols is scored as it is."""
     tracks: tuple[FloatArray, BoolArray] | None = None
     """(K, T, 3) of the video's own tracks, in the camera of their frame, NaN where there is none; and (K, T) seen."""
+
+    @property
+    def has_consistency(self) -> bool:
+        """Whether depth can be compared with itself: there are depth, intrinsics and the pose of every frame."""
+        if self.depths is None or self.intrinsics is None or self.world_T_cam is None:
+            return False
+        return bool(np.isfinite(self.world_T_cam).all())
 
 
 def score_estimate(
@@ -52,6 +65,7 @@ def score_estimate(
     pose_protocols: tuple[str, ...],
     depth_protocols: tuple[str, ...],
     masks: FrameSource[Int32Array] | None = None,
+    mask_source: str = NO_MASKS,
 ) -> dict[str, Any]:
     """Score an estimate.
 
@@ -61,12 +75,13 @@ def score_estimate(
         dataset: Name of the dataset, which decides on ranges.
         pose_protocols: Names.
         depth_protocols: Names.
-        masks: T label maps of the size of the estimate's depth, for self-consistency.
+        masks: T label maps of any size, for self-consistency; without them everything is taken for static.
+        mask_source: Which pixels they call static, in words: by whose masks.
 
     Returns:
         By kind: 'poses' and 'depth' by protocol, 'consistency', 'tracks', 'points'; a kind that cannot be scored is not
         there.
-        'regions' says whose masks parted the depth.
+        'regions' says whose masks parted the depth, 'masks' of 'consistency' whose masks those of the maps were.
     """
     truth = video.ground_truth
     found: dict[str, Any] = {}
@@ -83,14 +98,9 @@ def score_estimate(
         }
         if regions is not None:
             found["regions"] = "true masks" if truth.masks is not None else "masks of the cues"
-    if estimate.depths is not None and estimate.world_T_cam is not None and estimate.intrinsics is not None:
-        label = masks if masks is not None else no_masks(estimate.depths[0].shape, len(estimate.depths))
-        if np.isfinite(estimate.world_T_cam).all():
-            own = score_consistency(
-                estimate.depths, label, estimate.world_T_cam, estimate.intrinsics, lens=estimate.lens
-            )
-            if own is not None:
-                found["consistency"] = own.to_dict()
+    own = _score_self(estimate, masks)
+    if own is not None:
+        found["consistency"] = own.to_dict() | {"masks": NO_MASKS if masks is None else mask_source}
     if estimate.tracks is not None:
         tracked = _score_tracks(video, *estimate.tracks)
         if tracked is not None:
@@ -101,12 +111,18 @@ def score_estimate(
     return found
 
 
-def estimate_of_run(folder: Path, sequence: Sequence) -> Estimate:
-    """Return what a finished run says. Raises InputError if it cannot be read."""
+def estimates_of_run(folder: Path, sequence: Sequence) -> tuple[Estimate, Estimate]:
+    """Return what a finished run says, and the depth that it started from, seen by the run's cameras.
+
+    Raises:
+        InputError: If the run cannot be read.
+    """
     files = RunFolder(folder)
     found = load_reconstruction(files.reconstruction)
     depths = read_depth(files.depth) if files.depth.exists() else None
-    return Estimate(found.world_T_cam, depths, found.intrinsics, found.lens, _tracks_of(found, sequence))
+    cameras = found.world_T_cam, found.frame_intrinsics
+    own = Estimate(cameras[0], depths, cameras[1], found.lens, tracks=_tracks_of(found, sequence))
+    return own, Estimate(cameras[0], sequence.depths, cameras[1], found.lens, found.depth_log_scale)
 
 
 def poses_of_stages(folder: Path) -> dict[str, FloatArray]:
@@ -134,6 +150,19 @@ def _tracks_of(found: Reconstruction, sequence: Sequence) -> tuple[FloatArray, B
     seen[found.dynamic_track] = found.dynamic_observed
     points = np.stack([world_to_camera(pose, world[:, t]) for t, pose in enumerate(found.world_T_cam)], axis=1)
     return points, seen & np.isfinite(points).all(axis=2)
+
+
+def _score_self(estimate: Estimate, masks: FrameSource[Int32Array] | None) -> ConsistencyScore | None:
+    """Score depth against itself, with label maps brought to its size; None if something of it is not there."""
+    depths, poses, intrinsics = estimate.depths, estimate.world_T_cam, estimate.intrinsics
+    if not estimate.has_consistency or depths is None or poses is None or intrinsics is None:
+        return None
+    size = depths[0].shape
+    if masks is None:
+        masks = no_masks(size, len(depths))
+    elif masks[0].shape != size:
+        masks = ChangedFrames(masks, partial(resize_nearest, size=size))
+    return score_consistency(depths, masks, poses, intrinsics, lens=estimate.lens, log_scale=estimate.log_scale)
 
 
 def _score_points(

@@ -150,14 +150,15 @@ def depth_videos(title: str, protocol: str, methods: list[Method]) -> Table:
 
 
 def consistency_table(title: str, methods: list[Method], published: list[Row]) -> Table:
-    """Return self-consistency; no truth is needed."""
+    """Return self-consistency with the masks of the runs; no truth is needed."""
     keys = {"SC": "mean", "SC<0.01": "below_1", "SC<0.05": "below_5"}
     rows = [_averaged(m, lambda r, key: _of(r.scores.get("consistency"), key), keys) for m in methods]
-    told = (r.scores.get("consistency") for m in methods for r in m.results.values())
-    text = next((str(found["protocol"]) for found in told if found), "")
+    told = [found for m in methods for r in m.results.values() if (found := r.scores.get("consistency"))]
+    whose = " or ".join(sorted({str(found["masks"]) for found in told}))
+    notes = [f"{told[0]['protocol']}; static pixels: {whose}"] if told else []
     columns = [Column("SC"), Column("SC<0.01", better="high"), Column("SC<0.05", better="high"), *_COUNTS]
     return Table(
-        "consistency", f"{title}: self-consistency of depth", "method", columns, [*published, *rows], [text, _FAILED]
+        "consistency", f"{title}: self-consistency of depth", "method", columns, [*published, *rows], [*notes, _FAILED]
     )
 
 

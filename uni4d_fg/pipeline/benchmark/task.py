@@ -20,7 +20,7 @@ Masks: TypeAlias = Literal["cue", "true", "motion", "none"]
 
 _LONGEST_NAME = 200
 """Bytes."""
-RESULT_VERSION = 2
+RESULT_VERSION = 3
 """Part of every key; raised whenever scores come out otherwise."""
 
 

@@ -2,51 +2,53 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
-from uni4d_fg.errors import ConfigError, InputError, Uni4dFgError
-from uni4d_fg.frontend.datasets.base import Dataset
-from uni4d_fg.frontend.sequence.model import Video
+from uni4d_fg.arrays import Int32Array
+from uni4d_fg.errors import Cancelled, ConfigError, InputError, Uni4dFgError
+from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.pipeline.benchmark.methods.layouts import LAYOUTS
-from uni4d_fg.pipeline.benchmark.score import Estimate, score_estimate
+from uni4d_fg.pipeline.benchmark.prepare import masks_of_run, open_task
+from uni4d_fg.pipeline.benchmark.score import NO_MASKS, Estimate, score_estimate
 from uni4d_fg.pipeline.benchmark.tables import Method
-from uni4d_fg.pipeline.benchmark.task import TaskResult
+from uni4d_fg.pipeline.benchmark.task import Task, TaskResult
+
+Masks: TypeAlias = "Callable[[Task], tuple[FrameSource[Int32Array] | None, str]]"
+"""Gives the masks of a task's run, and in words, by whose masks pixels are static."""
 
 
-def read_method(
-    text: str,
-    dataset: Dataset,
-    root: Path,
-    videos: tuple[str, ...],
-    pose_protocols: tuple[str, ...],
-    depth_protocols: tuple[str, ...],
-) -> Method:
-    """Score what another program wrote about the videos of a dataset.
+def read_method(text: str, tasks: list[Task], masks: Masks = masks_of_run) -> Method:
+    """Score what another program wrote about the videos of a dataset, by the protocols and masks of runs of them.
 
     Args:
         text: ``LAYOUT:NAME=FOLDER``, or ``LAYOUT=FOLDER`` with the layout's name as that of the row.
-        dataset: Whose videos.
-        root: Its folder.
-        videos: Names; one without output counts as failed.
-        pose_protocols: Names.
-        depth_protocols: Names.
+        tasks: One per video, of any configuration; a video without output counts as failed.
+        masks: Gives the masks of a task, with which self-consistency is scored; asked only where that can be.
 
     Raises:
         ConfigError: If the text is not of that form, or there is no such layout.
+        Cancelled: If ``masks`` was stopped.
     """
     head, equals, folder = text.partition("=")
     layout, _, name = head.partition(":")
     if not equals or not folder or layout not in LAYOUTS:
         raise ConfigError(f"--read {text}: write LAYOUT:NAME=FOLDER with a layout of {', '.join(LAYOUTS)}")
     results = {}
-    for video in videos:
+    for task in tasks:
+        video = task.video
         try:
-            opened = dataset.open(root, video)
+            opened = open_task(task)
             estimate = _read(layout, Path(folder), video, opened)
-            scores = score_estimate(opened, estimate, dataset.card.name, pose_protocols, depth_protocols)
+            labels, source = masks(task) if estimate.has_consistency else (None, NO_MASKS)
+            protocols = task.pose_protocols, task.depth_protocols
+            scores = score_estimate(opened, estimate, task.dataset, *protocols, labels, source)
             results[video] = TaskResult("", video, name or layout, None, opened.num_frames, scores)
+        except Cancelled:
+            raise
         except Uni4dFgError as error:
             results[video] = TaskResult("", video, name or layout, failed=str(error))
     return Method(name or layout, results, "read", f"read from files in the layout of {layout}")
