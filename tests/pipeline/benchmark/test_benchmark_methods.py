@@ -187,6 +187,19 @@ def test_a_layout_is_read_as_it_is_written(layout: str, video: Video, tmp_path: 
     assert scores["poses"]["sim3"]["ate"] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_a_model_of_half_of_the_frames_says_so(video: Video, tmp_path: Path) -> None:
+    write_colmap(tmp_path, video)
+    path = tmp_path / "v" / "sparse" / "0" / "images.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:7]) + "\n")  # the last three of five frames
+    scores = score_estimate(video, LAYOUTS["colmap"].read(tmp_path, "v", video), "sintel", ("sim3",), ())
+    assert scores["poses"]["sim3"]["ate"] == pytest.approx(0.0, abs=1e-6)
+    assert scores["posed"] == {"posed": 3, "frames": 5}
+    path.write_text("\n".join(lines[:3]) + "\n")
+    scores = score_estimate(video, LAYOUTS["colmap"].read(tmp_path, "v", video), "sintel", ("sim3",), ())
+    assert (scores["poses"], scores["posed"]) == ({}, {"posed": 1, "frames": 5})
+
+
 def test_rows_by_time_or_number_belong_to_their_frames(video: Video) -> None:
     every = np.array([[float(v) for v in line.split()] for line in rows(video).splitlines()])
     some = poses_of_rows(Path("x"), every[[0, 3]], video.timestamps, scalar_first=False)

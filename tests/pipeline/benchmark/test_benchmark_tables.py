@@ -57,9 +57,39 @@ def test_averages_count_failures_and_weigh_as_the_protocol_says(tables: dict[str
     assert "tracks" not in tables  # counts alone make no table
 
 
+def test_frames_without_a_pose_are_counted_wherever_errors_of_poses_stand() -> None:
+    def scored(video: str, ate: float | None, posed: int) -> TaskResult:
+        poses = {} if ate is None else {"sim3": {"ate": ate, "rpe_translation": ate, "rpe_rotation_deg": 1.0}}
+        return TaskResult("", video, "x", None, 6, {"poses": poses, "posed": {"posed": posed, "frames": 6}})
+
+    whole = Method("whole", {"a": scored("a", 0.2, 6), "b": scored("b", 0.4, 6)})
+    part = Method("part", {"a": scored("a", 0.0, 3), "b": scored("b", None, 1), "c": TaskResult("", "c", "x", "none")})
+    found = {t.name: t for t in all_tables("sintel", "Sintel", [whole, part], ("sim3",), (), read_published())}
+    poses, videos = found["poses-sim3"], found["poses-sim3-videos"]
+    assert poses.cells()[-1] == ["part", "0.000", "0.000", "1.000", "4", "12", "1", "1"]
+    assert poses.cells()[-2] == ["whole", "0.300", "0.300", "1.000", "12", "12", "2", "0"]
+    assert "| Uni4D (published) | 0.110 | 0.032 | 0.338 | – | – | – | – |" in poses.markdown()
+    assert r"\textbf{0.000} & 1.000 & 4 & 12 & 1 & 1 \\" in poses.latex().replace(r"\textbf{1.000}", "1.000")
+    read = {row["method"]: row for row in csv.DictReader(io.StringIO(poses.comma_separated()))}
+    assert (read["part"]["posed"], read["part"]["of frames"]) == ("4", "12")
+    assert poses.data()["rows"][-1]["values"]["posed"] == 4
+    assert videos.names() == ["video", "whole ↓", "part ↓", "part, posed", "of frames"]
+    assert videos.cells() == [
+        ["a", "0.2000", "0.0000", "3", "6"], ["b", "0.4000", "–", "1", "6"], ["c", "–", "–", "–", "–"]
+    ]  # fmt: skip
+    short = short_table("Sintel", list(found.values()))
+    assert short is not None
+    assert short.cells()[1][:5] == ["part", "0.000", "1.000", "4", "12"]
+    alone = {t.name: t for t in all_tables("sintel", "Sintel", [whole], ("sim3",), (), [])}
+    assert alone["poses-sim3-videos"].names() == ["video", "whole ↓"]
+    short = short_table("Sintel", list(alone.values()))
+    assert short is not None
+    assert "posed" not in short.names()
+
+
 def test_printed_numbers_are_marked_and_say_where_they_are_from(tables: dict[str, Table]) -> None:
     text = tables["poses-sim3"].markdown()
-    assert "| Uni4D (published) | 0.110 | 0.032 | 0.338 | – | – |" in text
+    assert "| Uni4D (published) | 0.110 | 0.032 | 0.338 | – | – | – | – |" in text
     assert "CasualSAM, MonST3R, Uni4D, Uni4D*: Uni4D (arXiv 2503.21761), table 1" in text
     assert "| MonST3R (published) | 0.344 | 0.559 |" in tables["depth-uni4d-scale"].markdown()
 

@@ -80,7 +80,7 @@ def score_estimate(
 
     Returns:
         By kind: 'poses' and 'depth' by protocol, 'consistency', 'tracks', 'points'; a kind that cannot be scored is not
-        there.
+        there. 'posed' says how many of the frames with a true pose have an estimated one, which poses are scored on.
         'regions' says whose masks parted the depth, 'masks' of 'consistency' whose masks those of the maps were.
     """
     truth = video.ground_truth
@@ -90,6 +90,8 @@ def score_estimate(
             name: score_poses(POSE_PROTOCOLS[name], estimate.world_T_cam, truth.world_T_cam) for name in pose_protocols
         }
         found["poses"] = {name: score.to_dict() for name, score in scores.items() if score is not None}
+        known, told = (np.isfinite(poses).all(axis=(1, 2)) for poses in (truth.world_T_cam, estimate.world_T_cam))
+        found["posed"] = {"posed": int((known & told).sum()), "frames": int(known.sum())}
     if estimate.depths is not None and truth.depths is not None:
         regions = truth.masks if truth.masks is not None else video.masks
         found["depth"] = {

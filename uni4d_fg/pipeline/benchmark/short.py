@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from uni4d_fg.pipeline.benchmark.table import Column, Row, Table
+from uni4d_fg.pipeline.benchmark.tables import POSED, is_partial
 
 _CHOSEN = (
     ("poses-", {"ATE": "ATE, m", "RPE rot": "RPE rot, deg"}),
@@ -36,6 +37,8 @@ def short_table(title: str, tables: list[Table]) -> Table | None:
         table = next((t for t in fitting if t.name == _USUAL), fitting[0])
         if start in ("poses-", "depth-"):
             notes.append(f"{'poses' if start == 'poses-' else 'depth'}: `{table.name.removeprefix(start)}`")
+        if any(is_partial(row) for row in table.rows):  # an error of a part of the frames does not stand alone
+            names = {**names, **{column.name: column.name for column in POSED}}
         here = [column for column in table.columns if column.name in names]
         columns += [replace(column, name=names[column.name]) for column in here]
         for row in table.rows:

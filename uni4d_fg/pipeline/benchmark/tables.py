@@ -15,6 +15,8 @@ from uni4d_fg.results.evaluate.protocols.depth import DEPTH_PROTOCOLS, DepthScor
 from uni4d_fg.results.evaluate.protocols.pose import POSE_PROTOCOLS
 
 POSES = {"ATE": "ate", "RPE trans": "rpe_translation", "RPE rot": "rpe_rotation_deg"}
+POSED = (Column("posed", 0, ""), Column("of frames", 0, ""))
+"""Frames with an estimated pose, and frames with a true one."""
 REGIONS = ("all", "static", "moving")
 DEPTH_CUE = "depth cue"
 """Row of the depth that runs start from."""
@@ -74,25 +76,37 @@ def _says_something(table: Table) -> bool:
 
 
 def pose_table(title: str, protocol: str, methods: list[Method], published: list[Row]) -> Table:
-    """Return ATE and relative errors, averaged over the videos that have them."""
+    """Return ATE and relative errors, averaged over the videos that have them, and how many frames have a pose."""
 
     def value(result: TaskResult, key: str) -> float | None:
         return _pose(result, protocol, key)
 
-    rows = [_averaged(method, value, POSES) for method in methods]
-    columns = [Column("ATE"), Column("RPE trans"), Column("RPE rot"), *_COUNTS]
+    rows = [_with_posed(_averaged(method, value, POSES), method) for method in methods]
+    columns = [Column("ATE"), Column("RPE trans"), Column("RPE rot"), *POSED, *_COUNTS]
+    notes = [POSE_PROTOCOLS[protocol].text, "ATE and RPE trans in m, RPE rot in degrees; mean over videos"]
+    notes.append("errors are those of the frames that a method poses, of all with a true pose; frames of all videos")
     return Table(
         f"poses-{protocol}", f"{title}: camera poses, `{protocol}`", "method", columns, [*published, *rows],
-        [POSE_PROTOCOLS[protocol].text, "ATE and RPE trans in m, RPE rot in degrees; mean over videos", _FAILED],
+        [*notes, _FAILED],
     )  # fmt: skip
 
 
 def pose_videos(title: str, protocol: str, methods: list[Method]) -> Table:
-    """Return the ATE of every video."""
-    return _per_video(
+    """Return the ATE of every video; beside methods that leave frames without a pose, how many have one."""
+    table = _per_video(
         f"poses-{protocol}-videos", f"{title}: ATE of every video, m, `{protocol}`", methods,
         lambda result: _pose(result, protocol, "ate"), Column("", 4), [POSE_PROTOCOLS[protocol].text],
     )  # fmt: skip
+    partial = [method for method in methods if is_partial(_with_posed(Row(method.name, {}), method))]
+    if not partial:
+        return table
+    for row in table.rows:
+        for method in partial:
+            told = method.results[row.name].scores.get("posed") if row.name in method.results else None
+            if told is not None:
+                row.values.update({f"{method.name}, posed": told["posed"], "of frames": told["frames"]})
+    columns = [*table.columns, *(Column(f"{method.name}, posed", 0, "") for method in partial), POSED[1]]
+    return replace(table, columns=columns)
 
 
 def stages_table(title: str, protocol: str, methods: list[Method]) -> Table:
@@ -210,6 +224,12 @@ def runtime_table(title: str, methods: list[Method]) -> Table:
     return Table("runtime", f"{title}: runtime", "method", [*columns, *_COUNTS], rows, [note])
 
 
+def is_partial(row: Row) -> bool:
+    """Tell whether a row of the table of poses leaves some frames without one."""
+    posed, frames = (row.values.get(column.name) for column in POSED)
+    return posed is not None and frames is not None and posed < frames
+
+
 _COUNTS = (Column("videos", 0, ""), Column("failed", 0, ""))
 _FAILED = "videos that failed are counted, and not in the means"
 
@@ -222,6 +242,13 @@ def _averaged(method: Method, value: Callable[[TaskResult, str], float | None], 
         values[name] = float(np.mean(found)) if found else None
         scored = max(scored, len(found))
     return Row(method.name, values | {"videos": scored, "failed": method.failed}, method.kind, method.source)
+
+
+def _with_posed(row: Row, method: Method) -> Row:
+    """Return a row with the number of frames that have a pose, and of those with a true one, of all videos."""
+    told = [found for r in method.results.values() if (found := r.scores.get("posed"))]
+    counts = {"posed": sum(t["posed"] for t in told), "of frames": sum(t["frames"] for t in told)}
+    return replace(row, values=row.values | (counts if told else {}))
 
 
 def _per_video(
