@@ -34,9 +34,9 @@ def random_video(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def reference_scores(
-    name: str, dataset: str, truth: np.ndarray, prediction: np.ndarray, chosen: np.ndarray
-) -> tuple[float, float]:
-    """AbsRel and delta by the description of each program, on whole arrays."""
+    name: str, dataset: str, truth: np.ndarray, prediction: np.ndarray, regions: dict[str, np.ndarray]
+) -> dict[str, tuple[float, float]]:
+    """AbsRel and delta of every region by the description of each program, on whole arrays."""
     caps = {"sintel": (70.0, 70.0), "bonn": (70.0, None), "kitti": (None, None), "native": (70.0, 70.0)}[dataset]
     if name.startswith("uni4d"):
         caps = (70.0, 70.0)
@@ -60,7 +60,7 @@ def reference_scores(
                 s = np.sum(w * p * g) / np.sum(w * p**2)
             p = p * max(s, 1e-3)
         else:
-            s, t = torch_adam(p, g, 1000)
+            s, t = plain_adam(p, g, 1000)
             p = s * p + t
     else:
         d = (np.float32(1.0) / prediction)[mask].astype(np.float64)
@@ -78,15 +78,35 @@ def reference_scores(
         p = np.maximum(p, 1e-3)
     if caps[1] is not None:
         p = np.minimum(p, caps[1])
-    keep = chosen[mask]
-    p, g, frame = p[keep], g[keep], np.nonzero(mask)[0][keep]
     error = np.abs(p - g) / g
     p = np.maximum(p, 1e-5)
     inlier = (np.maximum(p / g, g / p) < 1.25).astype(float)
-    if low:
-        frames = np.unique(frame)
-        return tuple(float(np.mean([v[frame == f].mean() for f in frames])) for v in (error, inlier))  # type: ignore[return-value]
-    return float(error.mean()), float(inlier.mean())
+    found = {}
+    for region, chosen in regions.items():
+        keep, frame = chosen[mask], np.nonzero(mask)[0]
+        parts = [keep & (frame == f) for f in np.unique(frame[keep])] if low else [keep]
+        found[region] = tuple(float(np.mean([v[part].mean() for part in parts])) for v in (error, inlier))
+    return found  # type: ignore[return-value]
+
+
+def plain_adam(x: np.ndarray, y: np.ndarray, iterations: int) -> tuple[float, float]:
+    """Adam (Kingma and Ba 2015, algorithm 1) on the sum of absolute deviations, all pixels in every step."""
+    s, t = float(np.sort(y)[(len(y) - 1) // 2] / np.sort(x)[(len(x) - 1) // 2]), 0.0
+    m_s = m_t = v_s = v_t = 0.0
+    before = None
+    for step in range(1, iterations + 1):
+        residual = s * x + t - y
+        g_s, g_t = float(np.sum(np.sign(residual) * x)), float(np.sum(np.sign(residual)))
+        m_s, m_t = 0.9 * m_s + 0.1 * g_s, 0.9 * m_t + 0.1 * g_t
+        v_s, v_t = 0.999 * v_s + 0.001 * g_s**2, 0.999 * v_t + 0.001 * g_t**2
+        first, second = 1.0 - 0.9**step, 1.0 - 0.999**step
+        s -= 1e-4 * (m_s / first) / (np.sqrt(v_s / second) + 1e-8)
+        t -= 1e-4 * (m_t / first) / (np.sqrt(v_t / second) + 1e-8)
+        loss = float(np.abs(residual).sum())
+        if before is not None and abs(before - loss) < 1e-6:
+            break
+        before = loss
+    return s, t
 
 
 def torch_adam(x: np.ndarray, y: np.ndarray, iterations: int) -> tuple[float, float]:
@@ -106,15 +126,15 @@ def torch_adam(x: np.ndarray, y: np.ndarray, iterations: int) -> tuple[float, fl
     return s.item(), t.item()
 
 
-@pytest.mark.parametrize("name", [name for name in DEPTH_PROTOCOLS if name != "monst3r-scale-shift"])
+@pytest.mark.parametrize("name", DEPTH_PROTOCOLS)
 def test_depth_scores_equal_the_programs_descriptions(name: str, rng: np.random.Generator) -> None:
     protocol = DEPTH_PROTOCOLS[name]
     for case in range(CASES):
         dataset = ("sintel", "bonn", "kitti", "native")[case % 4]
         truth, prediction, masks = random_video(rng)
         found = score_depth(protocol, dataset, ArrayFrames(prediction), ArrayFrames(truth), ArrayFrames(masks))
-        for region, chosen in (("all", masks >= 0), ("static", masks == 0), ("moving", masks > 0)):
-            expected = reference_scores(name, dataset, truth, prediction, chosen)
+        regions = {"all": masks >= 0, "static": masks == 0, "moving": masks > 0}
+        for region, expected in reference_scores(name, dataset, truth, prediction, regions).items():
             score = found.regions[region]
             assert (score.abs_rel, score.delta_125) == pytest.approx(expected, rel=1e-6, abs=1e-6), (case, region)
 
@@ -127,6 +147,7 @@ def test_absolute_deviations_by_adam_equal_torch(rng: np.random.Generator) -> No
         iterations = 120 if case < 2 else 14
         line = adam_absolute(x, y, iterations=iterations)
         assert (line.scale, line.shift) == pytest.approx(torch_adam(x, y, iterations), rel=1e-6, abs=1e-6)
+        assert (line.scale, line.shift) == pytest.approx(plain_adam(x, y, iterations), rel=1e-6, abs=1e-6)
 
 
 def test_the_program_of_monst3r_leaves_scale_and_shift_near_its_start(rng: np.random.Generator) -> None:
@@ -248,6 +269,69 @@ def test_track_scores_equal_plain_loops(rng: np.random.Generator) -> None:
         found = (score.average_jaccard, score.points_within, score.occlusion_accuracy)
         expected = (np.mean(jaccard), np.mean(within), np.mean(seen == guessed))
         assert found == pytest.approx(expected, rel=1e-6)
+
+
+def consistency_by_loops(
+    depths: np.ndarray, masks: np.ndarray, poses: np.ndarray, cameras: np.ndarray, distance: int, occlusion: float
+) -> list[float]:
+    """Every static pixel with depth by itself: lifted, moved into the other frame, compared with the pixel there."""
+    errors = []
+    height, width = depths.shape[1:]
+    for t in range(len(depths) - distance):
+        fx, fy, cx, cy = cameras[t]
+        gx, gy, dx, dy = cameras[t + distance]
+        there_T_here = np.linalg.inv(poses[t + distance]) @ poses[t]
+        for v in range(height):
+            for u in range(width):
+                z = depths[t, v, u]
+                if not (np.isfinite(z) and z > 0.0) or masks[t, v, u] != 0:
+                    continue
+                x, y, other, _ = there_T_here @ (z * (u - cx) / fx, z * (v - cy) / fy, z, 1.0)
+                if other <= 1e-6:
+                    continue
+                column, row = round(gx * x / other + dx), round(gy * y / other + dy)
+                if not (0 <= column < width and 0 <= row < height) or masks[t + distance, row, column] != 0:
+                    continue
+                own = depths[t + distance, row, column]
+                if np.isfinite(own) and own > 0.0 and other / own - 1.0 <= occlusion:
+                    errors.append(abs(other / own - 1.0))
+    return errors
+
+
+def test_self_consistency_equals_plain_loops(rng: np.random.Generator) -> None:
+    compared = 0
+    for case in range(CASES):
+        count, height, width = int(rng.integers(2, 5)), int(rng.integers(9, 15)), int(rng.integers(9, 15))
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(scale=0.05, size=(count, 3))).as_matrix()
+        poses[:, :3, 3] = rng.normal(scale=0.2, size=(count, 3))
+        depths = rng.uniform(1.5, 2.5, (count, height, width)).astype(np.float32)
+        holes = rng.random(depths.shape)
+        for value, below in ((np.nan, 0.15), (0.0, 0.1), (-1.0, 0.05)):
+            depths[holes < below] = value
+        masks = (rng.random(depths.shape) < 0.2).astype(np.int32) * 3
+        intrinsics = np.array([9.0, 10.0, width / 2, height / 2]) * np.exp(rng.normal(scale=0.05, size=(count, 4)))
+        log_scale = rng.normal(scale=0.05, size=count)
+        distance, occlusion = 1 + case % min(2, count - 1), (0.25, 0.1)[case % 2]
+        cameras = intrinsics[0] if case % 3 == 0 else intrinsics  # one camera, or one that zooms
+        scaled = depths if case % 4 == 0 else depths * np.exp(log_scale)[:, None, None]
+        expected = consistency_by_loops(
+            np.asarray(scaled, np.float64), masks, poses, np.broadcast_to(cameras, (count, 4)), distance, occlusion
+        )
+        score = score_consistency(
+            ArrayFrames(depths), ArrayFrames(masks), poses, cameras, distance=distance, occlusion=occlusion,
+            log_scale=None if case % 4 == 0 else log_scale,
+        )  # fmt: skip
+        if not expected:  # nothing is seen twice
+            assert score is None
+            continue
+        assert score is not None
+        assert score.pixels == len(expected)
+        below = [float(np.mean([error < limit for error in expected])) for limit in (0.01, 0.05)]
+        found = score.mean, score.below_1, score.below_5
+        assert found == pytest.approx((np.mean(expected), *below), rel=1e-6, abs=1e-6), case
+        compared += len(expected)
+    assert compared > 50 * CASES
 
 
 def test_depth_of_a_plane_is_consistent_and_flicker_is_not(rng: np.random.Generator) -> None:
