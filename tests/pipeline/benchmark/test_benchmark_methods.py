@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.errors import ConfigError, InputError
@@ -185,6 +186,66 @@ def test_a_layout_is_read_as_it_is_written(layout: str, video: Video, tmp_path: 
         np.testing.assert_allclose(estimate.intrinsics, [20.0, 21.0, 7.5, 5.5])
     scores = score_estimate(video, estimate, "sintel", ("sim3",), ("metric",))
     assert scores["poses"]["sim3"]["ate"] == pytest.approx(0.0, abs=1e-6)
+
+
+def write_plain(folder: Path, video: Video, poses: str, depth: str) -> None:
+    """The layout 'files' in one of its forms, each written by its description."""
+    base, matrices = folder / "v", poses_of(video)
+    (base / "depth").mkdir(parents=True)
+    if poses == "c2w.npy":
+        np.save(base / "c2w.npy", matrices)
+    elif poses in ("poses.txt", "trajectory.kitti"):
+        np.savetxt(base / poses, matrices[:, :3].reshape(FRAMES, 12), fmt="%.12e")
+    else:
+        (folder / poses).write_text(rows(video))
+    if depth == "depth.npy":
+        np.save(base / "depth.npy", depth_of(video))
+        return
+    for i, values in enumerate(depth_of(video)):
+        path = base / "depth" / f"{i:03d}{depth[-4:]}"
+        if depth == ".png":
+            Image.fromarray(np.rint(values * 1000.0).astype(np.uint16)).save(path)
+        elif depth == ".exr":
+            path.write_bytes(exr(values, "zip"))
+        elif depth == "depth.npz":
+            np.savez(path, depth=values)
+        else:
+            np.savez(path, disp=1.0 / values)
+
+
+@pytest.mark.parametrize("poses", ["c2w.npy", "poses.txt", "trajectory.kitti", "v/traj.txt", "v.txt", "v.tum"])
+def test_every_form_of_a_trajectory_is_read(poses: str, video: Video, tmp_path: Path) -> None:
+    write_plain(tmp_path, video, poses, "depth.npy")
+    estimate = LAYOUTS["files"].read(tmp_path, "v", video)
+    assert estimate.world_T_cam is not None
+    np.testing.assert_allclose(estimate.world_T_cam, poses_of(video), atol=1e-9)
+
+
+@pytest.mark.parametrize("depth", ["depth.npy", "depth.npz", "disp.npz", ".exr", ".png"])
+def test_every_form_of_depth_is_read(depth: str, video: Video, tmp_path: Path) -> None:
+    assert video.ground_truth.depths is not None
+    values = video.ground_truth.depths[1]
+    values[3, 4] = 0.0  # no depth: 0 in every form, also as 1 / depth
+    with np.errstate(divide="ignore"):
+        write_plain(tmp_path, video, "c2w.npy", depth)
+    estimate = LAYOUTS["files"].read(tmp_path, "v", video)
+    assert estimate.depths is not None
+    found, expected = np.stack(list(estimate.depths)), depth_of(video)
+    assert np.argwhere(~np.isfinite(found)).tolist() == [[1, 3, 4]]
+    expected[1, 3, 4] = np.nan
+    # PNGs hold whole millimeters, the others what they were given.
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=0.00051 if depth == ".png" else 0.0)
+
+
+def test_files_of_another_number_of_frames_or_kind_are_refused(video: Video, tmp_path: Path) -> None:
+    write_plain(tmp_path, video, "poses.txt", ".png")
+    np.save(tmp_path / "v" / "depth" / "000.npy", depth_of(video)[0])
+    with pytest.raises(InputError, match="files of 2 kinds of depth"):
+        LAYOUTS["files"].read(tmp_path, "v", video)
+    (tmp_path / "v" / "depth" / "000.npy").unlink()
+    np.savetxt(tmp_path / "v" / "poses.txt", poses_of(video)[:4, :3].reshape(4, 12))
+    with pytest.raises(InputError, match="has 4 frames, the video 5"):
+        LAYOUTS["files"].read(tmp_path, "v", video)
 
 
 def test_a_model_of_half_of_the_frames_says_so(video: Video, tmp_path: Path) -> None:

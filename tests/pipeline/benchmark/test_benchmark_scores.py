@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import csv
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_scenes import sintel_task, synthesize
+from benchmark_scenes import CONFIG, sintel_task, synthesize
+from scipy.spatial.transform import Rotation
 
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence, Video
@@ -82,6 +86,43 @@ def test_what_is_read_is_scored_with_the_masks_of_the_runs(done: tuple[Task, Tas
     assert half == expected.to_dict() | {"masks": "by masks of the cues"}
     note = consistency_table("x", [Method("fast", {"alley_2": result}), whole], []).notes[0]
     assert note.endswith("left out; static pixels: by masks of the cues")
+
+
+def test_what_others_wrote_stands_in_the_tables_of_a_command(
+    done: tuple[Task, TaskResult], cli: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    task, result = done
+    write_as_files(task.run_folder, tmp_path / "whole" / "alley_2")
+    poses = load_reconstruction(RunFolder(task.run_folder).reconstruction).world_T_cam
+    (tmp_path / "part").mkdir()
+    rows = [(t, *poses[t, :3, 3], *Rotation.from_matrix(poses[t, :3, :3]).as_quat()) for t in (0, 1, 3, 6)]
+    np.savetxt(tmp_path / "part" / "alley_2.txt", rows, fmt="%.12g")
+    words = ["benchmark", "sintel", "--root", task.root, "--out", task.out, "--config", "fast", "--video", "alley_2",
+             "--protocol", "sim3", "--protocol", "uni4d-scale", "--no-pictures", "--quiet", "--workers", 1,
+             *(word for change in CONFIG for word in ("--set", change)),
+             "--read", f"files:Again={tmp_path / 'whole'}", "--read", f"dpvo={tmp_path / 'part'}",
+             "--read", f"monst3r={tmp_path / 'nothing'}"]  # fmt: skip
+    assert cli(*words)[0] == 0
+    tables = Path(task.out) / "tables"
+    found = {
+        name: {row["method"]: row for row in csv.DictReader((tables / f"{name}.csv").open())}
+        for name in ("poses-sim3", "depth-uni4d-scale", "consistency", "short")
+    }
+    own, again, part, none = (found["poses-sim3"][name] for name in ("fast", "Again", "dpvo", "monst3r"))
+    assert [row["kind"] for row in (own, again, part, none)] == ["run", "read", "read", "read"]
+    assert float(own["ATE"]) == result.scores["poses"]["sim3"]["ate"]
+    assert float(again["ATE"]) == pytest.approx(float(own["ATE"]), rel=1e-9)
+    assert [row["posed"] for row in (own, again, part, none)] == ["7", "7", "4", ""]
+    assert [row["failed"] for row in (own, again, part, none)] == ["0", "0", "0", "1"]
+    assert found["depth-uni4d-scale"]["Again"]["AbsRel moving"] == found["depth-uni4d-scale"]["fast"]["AbsRel moving"]
+    assert found["consistency"]["Again"]["SC"] == found["consistency"]["fast"]["SC"]
+    assert found["consistency"]["dpvo"]["SC"] == ""
+    assert (found["short"]["dpvo"]["posed"], found["short"]["dpvo"]["of frames"]) == ("4", "7")
+    for text in ((tables / "poses-sim3.md").read_text(), (tables / "poses-sim3.tex").read_text()):
+        assert "dpvo (read)" in text
+        assert "Again: read from files in the layout of files" in text
+    failed = json.loads((Path(task.out) / "benchmark.json").read_text())["failed"]
+    assert [list(failed[name]) for name in ("Again", "monst3r")] == [[], ["alley_2"]]
 
 
 @pytest.mark.parametrize(
