@@ -75,6 +75,23 @@ def test_masks_that_were_derived_for_sintel_are_true_masks(tmp_path: Path) -> No
     np.testing.assert_array_equal(np.stack(list(masks))[:5], truth.masks[:5] > 0)
 
 
+def test_a_zoom_of_sintel_has_the_mean_of_its_cameras_and_a_note(tmp_path: Path) -> None:
+    truth, dataset = miniatures.sintel(tmp_path), find_dataset("sintel")
+    fx, fy, cx, cy = truth.intrinsics
+    for spread, note in (
+        (0.008, ()),
+        (0.1, ("the film zooms, with focal lengths from 63 to 77 px: known intrinsics are their mean, 70 px, held for "
+               "all frames",)),
+    ):  # fmt: skip
+        for zoom, name, pose in zip(np.linspace(1 - spread, 1 + spread, 6), truth.names, truth.poses, strict=True):
+            matrix = np.array([[zoom * fx, 0, cx], [0, zoom * fy, cy], [0, 0, 1]])
+            path = tmp_path / "training" / "camdata_left" / "alley_2" / f"{name}.cam"
+            path.write_bytes(miniatures.cam(matrix, pose))
+        found = dataset.open(tmp_path, "alley_2").ground_truth.intrinsics
+        np.testing.assert_allclose(found, truth.intrinsics, rtol=1e-12)
+        assert dataset.notes(tmp_path, "alley_2") == note
+
+
 def test_davis_has_masks_by_the_index_of_the_palette(tmp_path: Path) -> None:
     truth = miniatures.davis(tmp_path)
     video = find_dataset("davis").open(tmp_path, "bear")

@@ -82,7 +82,10 @@ class Sintel(Dataset):
         return names_of_folders(self._base(root) / self.render)
 
     def open(self, root: Path, video: str) -> Video:
-        """Open one video; truth is poses, depth and intrinsics, and masks where they were derived."""
+        """Open one video; truth is poses, depth and intrinsics, and masks where they were derived.
+
+        Intrinsics are the mean over the frames, also where the film zooms; :meth:`notes` then says by how much.
+        """
         base = self._base(root)
         folder = self.need_folder(base / self.render / video, root)
         paths = images_of(folder, (".png",))
@@ -101,9 +104,23 @@ class Sintel(Dataset):
             world_T_cam=poses,
             depths=first_read(DptDepth(depth_paths, opened.image_size)),
             masks=masks,
-            intrinsics=_shared(matrices),
+            intrinsics=_each(matrices).mean(axis=0),
         )
         return replace(opened, ground_truth=truth)
+
+    def notes(self, root: Path, video: str) -> tuple[str, ...]:
+        """Say by how much the camera changes along the video, which one camera for all frames cannot express."""
+        base = self._base(root)
+        frames = images_of(base / self.render / video, (".png",))
+        each = _each(self._cameras(tuple(base / "camdata_left" / video / f"{path.stem}.cam" for path in frames))[0])
+        mean = each.mean(axis=0)
+        if np.abs(each - mean).max() <= MAX_VARIATION * mean[0]:
+            return ()
+        focal = each[:, 0]
+        return (
+            f"the film zooms, with focal lengths from {focal.min():.0f} to {focal.max():.0f} px: known intrinsics are "
+            f"their mean, {mean[0]:.0f} px, held for all frames",
+        )
 
     def _cameras(self, paths: tuple[Path, ...]) -> tuple[FloatArray, FloatArray]:
         pairs = [read_cam(path) for path in paths]
@@ -115,11 +132,9 @@ class Sintel(Dataset):
         return inner if inner.is_dir() else root
 
 
-def _shared(matrices: FloatArray) -> FloatArray | None:
-    """Return (4,) fx, fy, cx, cy of one camera; None where the video zooms."""
-    each = np.stack((matrices[:, 0, 0], matrices[:, 1, 1], matrices[:, 0, 2], matrices[:, 1, 2]), axis=1)
-    mean: FloatArray = each.mean(axis=0)
-    return mean if np.abs(each - mean).max() <= MAX_VARIATION * mean[0] else None
+def _each(matrices: FloatArray) -> FloatArray:
+    """Return (T, 4) fx, fy, cx, cy, px, of (T, 3, 3) matrices."""
+    return np.stack((matrices[:, 0, 0], matrices[:, 1, 1], matrices[:, 0, 2], matrices[:, 1, 2]), axis=1)
 
 
 class _MovingMasks(FileFrames[Int32Array]):

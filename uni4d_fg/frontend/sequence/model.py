@@ -54,7 +54,7 @@ class GroundTruth:
     masks: FrameSource[Int32Array] | None = None
     """T label maps (H, W), 0 static; what really moves."""
     intrinsics: FloatArray | None = None
-    """(4,) fx, fy, cx, cy, px."""
+    """(4,) fx, fy, cx, cy, px; the mean where the camera zooms."""
     track_points: FloatArray | None = None
     """(K, T, 3) world position of each of the sequence's own tracks, meters; NaN where unknown."""
     rigid_instance: Int32Array | None = None
