@@ -5,6 +5,10 @@
     2011_09_26/DRIVE/image_02/timestamps.txt                        optional
     2011_09_26/calib_cam_to_cam.txt                                 optional: true intrinsics
 
+By ``readme.txt`` and ``depth_read`` of the depth benchmark's development kit, depth is in PNGs of uint16: a value over
+256 is meters along the optical axis, and 0 is no value. By the ``readme.txt`` of the raw data's, ``P_rect_02`` is the
+3 x 4 projection of the rectified left color camera, of which the first three columns are the intrinsics.
+
 J. Uhrig et al., "Sparsity invariant CNNs", 3DV 2017 (depth); A. Geiger et al., "Vision meets robotics", IJRR 2013.
 """
 
