@@ -6,8 +6,10 @@ import csv
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from benchmark_scenes import synthesize
 
@@ -73,3 +75,29 @@ def test_benchmark_and_ablate_need_no_extra(root: Path, tmp_path: Path) -> None:
     assert rows["fast"]["videos"] == "2"
     stages = (tmp_path / "a" / "tables" / "stages-sim3.csv").read_text()
     assert "a, after bundle adjustment" in stages
+
+
+def test_two_workers_of_a_command_leave_the_bytes_of_a_serial_one(
+    root: Path, cli: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed")
+    videos = ("alley_2", "ambush_4")
+    words = ["benchmark", "sintel", "--root", root, "--config", "fast", *PLAIN, "--protocol", "uni4d-scale"]
+    words += [word for video in videos for word in ("--video", video)]
+    outs = {count: tmp_path / str(count) for count in (1, 2)}
+    for count, out in outs.items():
+        assert cli(*words, "--workers", count, "--out", out)[0] == 0
+    tables = {path.name for path in (outs[1] / "tables").iterdir() if path.stem not in ("runtime", "short")}
+    assert {"poses-sim3.csv", "poses-sim3-videos.tex", "depth-uni4d-scale.md", "consistency.csv"} <= tables
+    for name in tables:  # all but those with times
+        assert (outs[1] / "tables" / name).read_bytes() == (outs[2] / "tables" / name).read_bytes(), name
+    for video in videos:
+        one, two = (json.loads((out / "results" / "fast" / f"{video}.json").read_text()) for out in outs.values())
+        assert two["failed"] is None
+        assert json.dumps(one["scores"]) == json.dumps(two["scores"])
+        assert (one["key"], one["notes"]) == (two["key"], two["notes"])
+        runs = [out / "runs" / "fast" / video for out in outs.values()]
+        assert (runs[0] / "depth.npy").read_bytes() == (runs[1] / "depth.npy").read_bytes()
+        with np.load(runs[0] / "reconstruction.npz") as a, np.load(runs[1] / "reconstruction.npz") as b:
+            assert a.files == b.files
+            assert all(a[name].tobytes() == b[name].tobytes() for name in a.files)
