@@ -94,6 +94,22 @@ def test_printed_numbers_are_marked_and_say_where_they_are_from(tables: dict[str
     assert "| MonST3R (published) | 0.344 | 0.559 |" in tables["depth-uni4d-scale"].markdown()
 
 
+@pytest.mark.parametrize(
+    ("dataset", "printed"), [("sintel-clean", "sintel"), ("bonn-associated", "bonn"), ("bonn", None), ("kitti", None)]
+)
+def test_numbers_that_were_printed_for_another_variant_say_so(dataset: str, printed: str | None) -> None:
+    results = {"a": result("a", 0.1, 0.2, 100)}
+    found = all_tables(dataset, "x", [Method("ours", results)], ("sim3",), ("uni4d-scale",), read_published())
+    tables = [t for t in found if any(row.kind == "published" for row in t.rows)]
+    assert "depth-uni4d-scale" in {t.name for t in tables}
+    for table in tables:
+        row = next(row for row in table.rows if row.kind == "published")
+        said = f"; printed for `{printed}`, not for `{dataset}`" if printed else "table"
+        assert said in row.source
+        assert all(said in text for text in (table.markdown(), table.latex(), table.comma_separated()))
+        assert ("printed for" in row.source) == (printed is not None)
+
+
 def test_four_forms_hold_the_same() -> None:
     rows = [Row("a_1 & 50%", {"ATE": 0.12345, "n": 3}), Row("b", {"ATE": 0.2, "n": None}, "read", "x")]
     table = Table("t", "Title", "method", [Column("ATE"), Column("n", better="")], rows)

@@ -28,12 +28,14 @@ class Published:
     note: str = ""
 
     def fits(self, dataset: str, protocol: str) -> bool:
-        """Tell whether the row belongs to a dataset (its name, or what it begins with) and a protocol."""
+        """Tell whether the row belongs to a dataset, or a variant of it (``sintel-clean``), and a protocol."""
         return protocol == self.protocol and dataset.split("-")[0] == self.dataset.split("-")[0]
 
-    def row(self) -> Row:
-        """Return it as a row of a table."""
+    def row(self, dataset: str) -> Row:
+        """Return it as a row of a table of a dataset; its source says so if it was printed for another variant."""
         source = f"{self.source}; {self.note}" if self.note else self.source
+        if dataset != self.dataset:
+            source = f"{source}; printed for `{self.dataset}`, not for `{dataset}`"
         return Row(self.method, dict(self.values), "published", source)
 
 

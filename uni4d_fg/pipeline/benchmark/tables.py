@@ -54,14 +54,14 @@ def all_tables(
     """
     tables: list[Table] = []
     for name in pose_protocols:
-        told = [p.row() for p in published if p.fits(dataset, name)]
+        told = [p.row(dataset) for p in published if p.fits(dataset, name)]
         tables += [pose_table(title, name, methods, told), pose_videos(title, name, methods)]
         tables += [stages_table(title, name, methods)]
     for name in depth_protocols:
-        told = [p.row() for p in published if p.fits(dataset, name)]
+        told = [p.row(dataset) for p in published if p.fits(dataset, name)]
         with_cue = [*methods, *_cues(methods)]
         tables += [depth_table(title, name, with_cue, told), depth_videos(title, name, with_cue)]
-    told = [p.row() for p in published if p.fits(dataset, "consistency")]
+    told = [p.row(dataset) for p in published if p.fits(dataset, "consistency")]
     tables += [consistency_table(title, [*methods, *_cues(methods)], told), points_table(title, methods)]
     tables += [tracks_table(title, methods)]
     tables += [runtime_table(title, methods)]
