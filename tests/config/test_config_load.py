@@ -232,6 +232,12 @@ def test_every_field_says_what_it_means_and_takes() -> None:
         ("paper", "energy=map", ["camera_init.kernel.kind=norm", "nonrigid.arap_kernel.kind=norm"]),
         ("paper", "nonrigid.depth_prior=true", ["energy 'paper'", "nonrigid.depth_prior=true"]),
         ("paper", "nonrigid.arap_kernel.kind=cauchy", ["nonrigid.arap_kernel.kind=cauchy"]),
+        ("paper", "camera_init.kernel.kind=huber", ["camera_init.kernel.kind=huber"]),
+        (
+            "paper",
+            "bundle_adjustment.reprojection_kernel.kind=quadratic",
+            ["bundle_adjustment.reprojection_kernel.kind=quadratic"],
+        ),
     ],
 )
 def test_a_mixture_of_the_energies_is_one_error_that_lists_what_contradicts(
@@ -249,6 +255,8 @@ def test_either_energy_may_lose_a_term_and_change_its_numbers() -> None:
     paper = load_config("paper", ["nonrigid.arap_weight=0", "nonrigid.arap_kernel.threshold=0.01"])
     paper = with_overrides(paper, ["nonrigid.annealing=[1]", "nonrigid.depth_kernel.kind=cauchy", "solver=adam"])
     assert (paper.energy, paper.nonrigid.arap_weight, paper.nonrigid.annealing) == ("paper", 0.0, (1.0,))
+    squared = load_config("paper", ["camera_init.kernel={kind: quadratic}"])
+    assert (squared.camera_init.kernel.kind, squared.energy) == ("quadratic", "paper")
     robust = load_config("default", ["nonrigid.depth_prior=false", "nonrigid.arap_kernel.kind=cauchy"])
     assert not robust.nonrigid.depth_prior
 

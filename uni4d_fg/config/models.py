@@ -113,7 +113,9 @@ class Config(Section):
             kernels["bundle_adjustment.depth_kernel"] = adjustment.depth_kernel
             kernels["nonrigid.depth_kernel"] = moving.depth_kernel
         for path, kernel in kernels.items():
-            if (kernel.kind == "norm") != paper:
+            # Equation 4 of the paper's text, stage 1, squares the norm.
+            squared_by_text = paper and path == "camera_init.kernel" and kernel.kind == "quadratic"
+            if (kernel.kind == "norm") != paper and not squared_by_text:
                 yield f"{path}.kind={kernel.kind}"
         if not paper and moving.proximal_weight > 0:
             yield "nonrigid.proximal_weight"

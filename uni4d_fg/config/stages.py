@@ -61,7 +61,11 @@ class CameraInitConfig(Section):
     reprojection_sigma_px: float = setting(
         1.0, "Standard deviation of a depth reprojection residual, px.", gt=0, basic=True
     )
-    kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Kernel of depth reprojection.")
+    kernel: KernelConfig = setting(
+        KernelConfig(kind="huber", threshold=1.345),
+        "Kernel of depth reprojection. Energy 'paper' takes 'norm' (the program) or, in this stage only, 'quadratic', "
+        "half the squared norm (the paper's text).",
+    )
     camera_motion: CameraMotionConfig = setting(
         CameraMotionConfig(rotation_weight=0.0, translation_weight=0.0), "E_cam within the window."
     )

@@ -199,6 +199,19 @@ def test_the_energy_of_a_window_is_the_sum_over_its_pairs(
         assert energies["depth_reprojection"] == pytest.approx(float(means @ counts), rel=1e-6)
 
 
+def test_the_squared_norm_of_the_papers_text_ends_where_squares_do(
+    exact: LabelledTracks, rng: np.random.Generator
+) -> None:
+    """The two energies differ by weights alone, which are all 1 with plain sums: the solutions are one."""
+    noisy = shift(exact, rng.normal(scale=0.5, size=exact.tracks.uv.shape))
+    squared = CONFIG.model_copy(update={"kernel": KernelConfig(kind="quadratic")})
+    text = initialize(noisy, squared, energy=PaperEnergy("sum"))
+    likelihood = initialize(noisy, squared, energy=MAP)
+    np.testing.assert_array_equal(text.cameras.world_T_cam, likelihood.cameras.world_T_cam)
+    truth = camera_path(FRAMES)
+    assert 1e-4 < np.abs(text.cameras.world_T_cam - truth)[:, :3, 3].max() < 0.05
+
+
 def test_only_the_newer_frames_of_a_window_are_free(exact: LabelledTracks) -> None:
     state = State({POSE: camera_path(FRAMES), INTRINSICS: K[None]})
     stage = window_stage(

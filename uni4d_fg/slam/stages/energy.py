@@ -3,10 +3,11 @@ r"""The choice of energy: one object that gives sigma, weight and kernel of ever
 ``MAP``     E = sum_n w_n rho(|r_n| / sigma): a maximum a posteriori estimate with noise in the residual's unit.
 ``paper``   E = sum over terms of w |r_n|: Uni4D's unsquared norms with its term weights. ``mean`` divides an
             observation by what its cell (frame, or frame pair) holds and by the number of cells, and a link by the
-            number of links, as the authors' program does; ``sum`` divides nothing, as the paper's text has it.
+            number of links, as the authors' program does; ``sum`` divides nothing, as the paper's text has it. In
+            stage 1 a quadratic kernel gives w |r_n|^2 / 2, half of what the text has there (equation 4).
 
 Unsquared norms are smoothed at zero for solvers that need a second derivative; ``Problem.energies(state, exact=True)``
-scores them without. The configuration refuses kernels of the other energy.
+scores them without. The configuration refuses kernels of the other energy everywhere else.
 """
 
 from __future__ import annotations
