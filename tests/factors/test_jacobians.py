@@ -23,7 +23,7 @@ from uni4d_fg.errors import SolverError
 from uni4d_fg.factors import FactorType, factor, factor_type, factor_types
 from uni4d_fg.factors import batch as batch_module
 from uni4d_fg.factors.arap import arap
-from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation, relative_camera_translation
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, static_depth_prior
 from uni4d_fg.factors.depth_reprojection import depth_reprojection
 from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection
@@ -177,13 +177,44 @@ def test_constant_relative_motion_has_no_camera_energy(rng: np.random.Generator)
     poses = [start, start @ rotation, start @ rotation @ rotation]
     floor = np.full(N, 1e-3)
     np.testing.assert_allclose(camera_rotation.residual(*poses, floor=floor), 0.0, atol=1e-9)
+    rotation[:, :3, 3] = rng.normal(scale=0.1, size=(N, 3))
+    circling = [start, start @ rotation, start @ rotation @ rotation]
+    np.testing.assert_allclose(relative_camera_translation.residual(*circling, floor=floor), 0.0, atol=1e-9)
     v = rng.normal(scale=0.1, size=(N, 3))
     for i, pose in enumerate(poses):
         pose[:, :3, 3] = start[:, :3, 3] + i * v
     np.testing.assert_allclose(camera_translation.residual(*poses, floor=floor), 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [camera_rotation, camera_translation], ids=["rotation", "translation"])
+def test_axes_do_not_matter_where_the_camera_does_not_turn(rng: np.random.Generator) -> None:
+    """The residuals are the same vector in other axes; where the camera turns, the two energies are not the same."""
+    rotation = random_poses(rng)[:, :3, :3]
+    poses, floor = [random_poses(rng) for _ in range(3)], np.full(N, 1e-3)
+    sizes = [
+        np.linalg.norm(kind.residual(*poses, floor=floor), axis=1)
+        for kind in (camera_translation, relative_camera_translation)
+    ]
+    assert np.abs(sizes[0] - sizes[1]).max() > 0.02
+    for pose in poses:
+        pose[:, :3, :3] = rotation
+    world = camera_translation.residual(*poses, floor=floor)
+    camera = relative_camera_translation.residual(*poses, floor=floor)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", rotation, camera), world, atol=1e-12)
+
+
+def test_the_relative_translation_is_that_of_the_relative_pose_of_the_paper(rng: np.random.Generator) -> None:
+    before, now, after = (random_poses(rng) for _ in range(3))
+    first, second = (np.linalg.inv(b) @ a for a, b in ((before, now), (now, after)))
+    sizes = [np.sqrt(np.sum(pose[:, :3, 3] ** 2, axis=1) + 1e-6) for pose in (first, second)]
+    expected = 2.0 * (second - first)[:, :3, 3] / (sizes[0] + sizes[1])[:, None]
+    found = relative_camera_translation.residual(before, now, after, floor=np.full(N, 1e-3))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+MOTIONS = [camera_rotation, camera_translation, relative_camera_translation]
+
+
+@pytest.mark.parametrize("kind", MOTIONS, ids=[kind.name for kind in MOTIONS])
 def test_camera_at_rest_has_zero_energy_and_finite_jacobians(kind: FactorType) -> None:
     rest = np.tile(np.eye(4), (N, 1, 1))
     r, jacobians = kind.linearize(rest, rest, rest, floor=np.full(N, 1e-3))

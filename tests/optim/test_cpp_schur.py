@@ -13,7 +13,7 @@ from solve_samples import LANDMARK_PRIOR, POINT_PRIOR, bundle, pair_terms
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import SolverError
 from uni4d_fg.factors import FactorBatch, FactorType, Kernel, Slot, VariableType
-from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation, relative_camera_translation
 from uni4d_fg.factors.depth_prior import static_depth_prior
 from uni4d_fg.factors.lens_reprojection import fisheye_reprojection, opencv_reprojection
 from uni4d_fg.factors.priors import intrinsics_prior, log_scale_prior, scale_anchor
@@ -133,6 +133,7 @@ def camera_terms(rng: np.random.Generator) -> Sample:
             *problem.batches,
             FactorBatch.create(camera_rotation, three, floor, sigma=0.1),
             FactorBatch.create(camera_translation, three, floor, sigma=0.1, kernel=Kernel("huber", 1.0)),
+            FactorBatch.create(relative_camera_translation, three, floor, sigma=0.2, kernel=Kernel("norm", 0.01)),
             FactorBatch.create(scale_anchor, ends, {"distance": np.array([0.5])}, sigma=1e-2),
             pair_terms(rng, n, 40, True),
         ),

@@ -23,6 +23,11 @@ class CameraMotionConfig(Section):
         gt=0,
     )
     translation_floor_m: float = setting(1e-3, "Guard added to the denominator of E_trans, m.", gt=0)
+    translation_axes: Literal["world", "camera"] = setting(
+        "world",
+        "Axes in which E_trans compares two successive motions: 'world' (the reference program), or for each motion "
+        "those of the 'camera' at its end: the relative poses of the paper's text, which a steady turn leaves alone.",
+    )
     norm_threshold: float = setting(
         3e-3, "Smoothing at zero of both norms (energy 'paper' only); the larger, the farther the minimum moves.", gt=0
     )

@@ -2,7 +2,7 @@
 
 from uni4d_fg.factors.arap import arap
 from uni4d_fg.factors.camera_acceleration import camera_angular_acceleration, camera_linear_acceleration
-from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation, relative_camera_translation
 from uni4d_fg.factors.camera_priors import fisheye_camera_prior, opencv_camera_prior
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, joint_dynamic_depth_prior, static_depth_prior
 from uni4d_fg.factors.depth_reprojection import depth_reprojection
@@ -35,6 +35,7 @@ __all__ = [
     "log_scale_prior",
     "opencv_camera_prior",
     "opencv_reprojection",
+    "relative_camera_translation",
     "rigid_depth_prior",
     "rigid_reprojection",
     "rigid_smoothness",

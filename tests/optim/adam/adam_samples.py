@@ -8,7 +8,7 @@ import torch
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.factors import FactorBatch, FactorType, Kernel, Slot
 from uni4d_fg.factors.arap import arap
-from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation, relative_camera_translation
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, static_depth_prior
 from uni4d_fg.factors.depth_reprojection import depth_reprojection
 from uni4d_fg.factors.dynamic_reprojection import dynamic_reprojection
@@ -41,6 +41,7 @@ FAMILIES = [
     acceleration_smoothness,
     camera_rotation,
     camera_translation,
+    relative_camera_translation,
     aspect_prior,
     intrinsics_prior,
     log_scale_prior,

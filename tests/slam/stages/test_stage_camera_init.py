@@ -17,16 +17,22 @@ from uni4d_fg.factors.variable_types import INTRINSICS, POSE
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
+from uni4d_fg.optim.backend import choose_backend
+from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import LevenbergMarquardtRunner, Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.stages.camera_init import CameraInitResult, PairSource, initialize_cameras, window_stage
 from uni4d_fg.slam.stages.energy import MAP, Normalization, PaperEnergy
+from uni4d_fg.slam.stages.terms import camera_motion_terms
 
 FRAMES, WINDOW = 12, 4
 CONFIG = CameraInitConfig(
     window=WINDOW, solver=SolverConfig(max_iterations=30, relative_decrease=1e-8, gradient_tolerance=1e-12)
 )
+
+needs_extension = pytest.mark.skipif(find_extension()[0] is None, reason=find_extension()[1] or "installed")
 
 
 @pytest.fixture
@@ -210,6 +216,41 @@ def test_the_squared_norm_of_the_papers_text_ends_where_squares_do(
     np.testing.assert_array_equal(text.cameras.world_T_cam, likelihood.cameras.world_T_cam)
     truth = camera_path(FRAMES)
     assert 1e-4 < np.abs(text.cameras.world_T_cam - truth)[:, :3, 3].max() < 0.05
+
+
+def test_axes_of_the_camera_leave_a_steady_turn_alone() -> None:
+    """Poses D, D^2, D^3, ...: in axes of the camera the motion is constant, in those of the world it turns."""
+    step = se3.se3_exp(np.array([[0.0, 0.2, 0.0, 0.1, 0.0, 0.3]]))[0]
+    poses = np.stack([np.linalg.matrix_power(step, t) for t in range(5)])
+    energies = {}
+    for axes in ("world", "camera"):
+        motion = CameraMotionConfig(rotation_weight=0.0, translation_axes=axes)  # type: ignore[arg-type]
+        problem = Problem().add(camera_motion_terms(np.arange(5), motion, PaperEnergy("sum")))
+        energies[axes] = problem.energies(State({POSE: poses}), exact=True)
+    assert energies["camera"]["camera_translation"] < 1e-12
+    # Three changes of direction by 0.2 rad each, a chord of 2 sin 0.1 of the steps' equal length.
+    length = np.linalg.norm(step[:3, 3])
+    assert energies["world"]["camera_translation"] == pytest.approx(
+        6.0 * np.sin(0.1) * length / np.sqrt(length**2 + 1e-6), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("changed", [{"translation_axes": "camera"}, {"kernel": KernelConfig(kind="quadratic")}])
+@needs_extension
+def test_both_backends_end_alike_with_what_the_papers_text_has(
+    exact: LabelledTracks, rng: np.random.Generator, changed: dict[str, object]
+) -> None:
+    """Also where C++ has no kernel of a term."""
+    noisy = shift(exact, rng.normal(scale=0.5, size=exact.tracks.uv.shape))
+    motion = CameraMotionConfig(**{k: v for k, v in changed.items() if k != "kernel"})  # type: ignore[arg-type]
+    kernel = changed.get("kernel", KernelConfig(kind="norm", threshold=0.1))
+    config = CONFIG.model_copy(update={"kernel": kernel, "camera_motion": motion})
+    ours, theirs = (
+        initialize(noisy, config, energy=PaperEnergy(), run=LevenbergMarquardtRunner(choose_backend(name)))
+        for name in ("python", "cpp")
+    )
+    assert theirs.windows[-1].notes["backend"] == "cpp"
+    np.testing.assert_allclose(theirs.cameras.world_T_cam, ours.cameras.world_T_cam, atol=1e-4)
 
 
 def test_only_the_newer_frames_of_a_window_are_free(exact: LabelledTracks) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.imu import ImuConfig
 from uni4d_fg.factors.camera_acceleration import camera_angular_acceleration, camera_linear_acceleration
-from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation, relative_camera_translation
 from uni4d_fg.factors.priors import gravity_magnitude, scale_anchor
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import GRAVITY, IMU_BIAS, POSE, VELOCITY
@@ -57,7 +57,8 @@ class ImuSource:
             GRAVITY: self.start.gravity[None],
         }
         replaced = [
-            scale_anchor, camera_rotation, camera_translation, camera_angular_acceleration, camera_linear_acceleration,
+            scale_anchor, camera_rotation, camera_translation, relative_camera_translation, camera_angular_acceleration,
+            camera_linear_acceleration,
         ]  # fmt: skip
         return Addition(self._inertial_factors(), variables, replaces=replaced)
 

@@ -8,7 +8,7 @@ from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.config.stages import CameraMotionConfig
 from uni4d_fg.factors.batch import FactorBatch
-from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation
+from uni4d_fg.factors.camera_motion import camera_rotation, camera_translation, relative_camera_translation
 from uni4d_fg.factors.priors import aspect_prior, intrinsics_prior
 from uni4d_fg.slam.stages.energy import Energy
 
@@ -21,9 +21,10 @@ def camera_motion_terms(frames: IntArray, config: CameraMotionConfig, energy: En
     kernel = KernelConfig(kind="quadratic")
     if not energy.is_likelihood:
         kernel = KernelConfig(kind="norm", threshold=config.norm_threshold)
+    translation = camera_translation if config.translation_axes == "world" else relative_camera_translation
     terms = (
         (camera_rotation, config.rotation_weight, config.rotation_floor_rad),
-        (camera_translation, config.translation_weight, config.translation_floor_m),
+        (translation, config.translation_weight, config.translation_floor_m),
     )
     triples = [frames[i : count + i] for i in range(3)]
     return [
