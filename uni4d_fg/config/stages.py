@@ -231,6 +231,11 @@ class NonRigidConfig(Section):
     arap_sigma_m: float = setting(0.01, "Sigma of the change of a neighbor distance, m.", gt=0, basic=True)
     arap_weight: float = setting(1.0, "Weight of ARAP; 0 switches the term off.", ge=0, basic=True)
     arap_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=1.345), "Its kernel.")
+    arap_mutual_pairs: Literal["once", "twice"] = setting(
+        "once",
+        "How often ARAP counts a pair of which each is a neighbor of the other: 'once', or 'twice' as in the reference "
+        "program, which lists the neighbors of every track. All other pairs count once.",
+    )
     annealing: tuple[float, ...] = setting(
         (1.0,), "Successive solves with the smoothing of every 'norm' kernel multiplied by these factors; ends at 1."
     )

@@ -9,12 +9,17 @@ import pytest
 from stage_samples import K, camera_path, hide, join, observe, shift
 
 from uni4d_fg.config.stages import NonRigidConfig
+from uni4d_fg.factors.arap import arap
+from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import DYNAMIC_POINT
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
+from uni4d_fg.optim.backend import choose_backend
+from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.stage import LevenbergMarquardtRunner
 from uni4d_fg.optim.summary import Termination
-from uni4d_fg.slam.stages.energy import MAP, Energy, PaperEnergy
-from uni4d_fg.slam.stages.nonrigid import PointMesh, build_mesh, solve_nonrigid
+from uni4d_fg.slam.stages.energy import MAP, Energy, Normalization, PaperEnergy
+from uni4d_fg.slam.stages.nonrigid import PointMesh, build_mesh, motion_terms, solve_nonrigid
 from uni4d_fg.slam.stages.observations import observations_of
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise
 
@@ -23,6 +28,8 @@ POSES = camera_path(FRAMES)
 CAMERAS = Cameras(POSES, K, np.zeros(FRAMES))
 NOISE = StaticNoise(0.5, 0.02)
 CONFIG = NonRigidConfig()
+
+needs_extension = pytest.mark.skipif(find_extension()[0] is None, reason=find_extension()[1] or "installed")
 
 
 def changed(**fields: object) -> NonRigidConfig:
@@ -138,11 +145,53 @@ def test_a_link_reads_both_points_in_both_frames(exact: LabelledTracks) -> None:
     hidden = np.zeros((50, FRAMES), bool)
     hidden[0, 5:] = True
     mesh, _, _ = mesh_of(hide(exact, hidden))
-    rows = mesh.linked(observed_only=False)
+    rows, pair = mesh.linked(observed_only=False)
     of_first = int((mesh.pairs == 0).any(axis=1).sum())
     assert len(rows[0]) == (len(mesh.pairs) - of_first) * (FRAMES - 1) + of_first * 4
     np.testing.assert_array_equal(rows[2] - rows[0], 1)
     np.testing.assert_array_equal(rows[3] - rows[1], 1)
+    here, _ = np.nonzero(mesh.row[mesh.pairs[pair, 0]] == rows[0][:, None])
+    np.testing.assert_array_equal(here, np.arange(len(pair)))
+
+
+@pytest.mark.parametrize("normalization", ["mean", "sum"])
+def test_mutual_neighbors_may_count_twice(exact: LabelledTracks, normalization: Normalization) -> None:
+    """As a sum, or a mean, over a list in which such a pair stands twice."""
+    config = changed(arap_kernel={"kind": "norm"}, arap_weight=100.0)
+    mesh, points, _ = mesh_of(exact, config)
+    state = State({DYNAMIC_POINT: points + np.sin(np.arange(points.size)).reshape(points.shape)})
+    rows, pair = mesh.linked(observed_only=False)
+    listed = [np.repeat(r, mesh.times[pair]) for r in rows]
+    energy = PaperEnergy(normalization)
+    repeated = arap(*listed, **energy.linked(0.01, 100.0, config.arap_kernel, len(listed[0])))
+    for how, expected in (("twice", repeated.energy(state)), ("once", None)):
+        terms = motion_terms(mesh, config.model_copy(update={"arap_mutual_pairs": how}), energy)
+        found = next(term for term in terms if term.name == "arap")
+        assert len(found) == len(pair)
+        if expected is None:
+            assert abs(found.energy(state) / repeated.energy(state) - 1.0) > 1e-3
+            assert len(set(found.weight.tolist())) == 1
+        else:
+            assert found.energy(state) == pytest.approx(expected, rel=1e-12)
+
+
+@needs_extension
+def test_both_backends_count_mutual_neighbors_twice(exact: LabelledTracks, rng: np.random.Generator) -> None:
+    noisy = with_depth_noise(exact, rng, 0.02)
+    exactly = {"relative_decrease": 1e-12, "early_relative_decrease": None, "cg_tolerance": 1e-6}
+    solver = CONFIG.solver.model_copy(update={**exactly, "max_iterations": 200})
+    ours, theirs, once = (
+        solve(
+            noisy, CONFIG.model_copy(update={"arap_mutual_pairs": how, "solver": solver}),
+            run=LevenbergMarquardtRunner(choose_backend(name)),
+        )
+        for name, how in (("python", "twice"), ("cpp", "twice"), ("cpp", "once"))
+    )  # fmt: skip
+    np.testing.assert_array_equal(theirs.track, ours.track)
+    np.testing.assert_allclose(theirs.points, ours.points, atol=1e-5)
+    here = np.flatnonzero(np.isin(ours.track, once.track))
+    there = np.flatnonzero(np.isin(once.track, ours.track))
+    assert np.nanmax(np.abs(once.points[there] - ours.points[here])) > 1e-3
 
 
 def test_exact_cues_are_left_alone(exact: LabelledTracks, truth: np.ndarray) -> None:

@@ -52,10 +52,10 @@ def mesh_of(motion: DynamicScene, config: Config) -> PointMesh:
     row = np.full(exists.shape, -1)
     row[exists] = np.arange(int(exists.sum()))
     stage = config.nonrigid
-    pairs = nearest_neighbors(
+    pairs, times = nearest_neighbors(
         motion.points, motion.observed, motion.instance, stage.neighbors, stage.max_neighbor_ratio
     )
-    return PointMesh(motion.track, motion.instance, row, motion.observed, pairs)
+    return PointMesh(motion.track, motion.instance, row, motion.observed, pairs, times)
 
 
 def joint_state(scene: StaticScene, motion: DynamicScene, mesh: PointMesh) -> State:

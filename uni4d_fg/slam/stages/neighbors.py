@@ -10,7 +10,7 @@ from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 
 def nearest_neighbors(
     points: FloatArray, observed: BoolArray, instance: IntArray, count: int, max_ratio: float
-) -> IntArray:
+) -> tuple[IntArray, IntArray]:
     """Link every trajectory to its nearest neighbors of the same instance.
 
     Neighbors are searched in the frame in which most of the instance's trajectories are seen together with
@@ -24,7 +24,8 @@ def nearest_neighbors(
         max_ratio: Links longer than this many times the instance's median link are dropped.
 
     Returns:
-        (L, 2) pairs of trajectories, first < second, each once.
+        (L, 2) pairs of trajectories, first < second, each once, and how often each was found, (L,): 2 where each is a
+        neighbor of the other, else 1.
     """
     pairs = [np.zeros((0, 2), dtype=np.int64)]
     usable = observed & np.isfinite(points).all(axis=2)
@@ -51,4 +52,5 @@ def nearest_neighbors(
         if found:
             pair, length = np.concatenate(found), np.concatenate(lengths)
             pairs.append(np.sort(pair[length <= max_ratio * np.median(length)], axis=1))
-    return np.unique(np.concatenate(pairs), axis=0)
+    unique, found_times = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
+    return unique, found_times.astype(np.int64)

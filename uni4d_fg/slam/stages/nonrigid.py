@@ -46,6 +46,8 @@ class PointMesh:
     """(M, T)."""
     pairs: IntArray
     """(L, 2) neighboring trajectories, each pair once."""
+    times: IntArray
+    """(L,) 2 where each of a pair is a neighbor of the other, else 1."""
 
     @property
     def num_points(self) -> int:
@@ -64,15 +66,15 @@ class PointMesh:
         trajectory, frame = np.nonzero(complete)
         return [self.row[trajectory, frame + i] for i in range(steps)]
 
-    def linked(self, observed_only: bool) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Return the rows (k, t), (m, t), (k, t+1), (m, t+1) of every link that exists in both frames."""
+    def linked(self, observed_only: bool) -> tuple[list[IntArray], IntArray]:
+        """Return the rows (k, t), (m, t), (k, t+1), (m, t+1) of every link that exists in both frames, and its pair."""
         exists = self.row >= 0
         if observed_only:
             exists = exists & self.observed
         both = exists[self.pairs[:, 0]] & exists[self.pairs[:, 1]]
         link, frame = np.nonzero(both[:, :-1] & both[:, 1:])
         k, m = self.pairs[link, 0], self.pairs[link, 1]
-        return self.row[k, frame], self.row[m, frame], self.row[k, frame + 1], self.row[m, frame + 1]
+        return [self.row[k, frame], self.row[m, frame], self.row[k, frame + 1], self.row[m, frame + 1]], link
 
 
 def nonrigid_problem(
@@ -111,10 +113,14 @@ def motion_terms(mesh: PointMesh, config: NonRigidConfig, energy: Energy = MAP) 
         smoothness = velocity_smoothness if config.smoothness_order == 1 else acceleration_smoothness
         sigma, weight, kernel = config.smoothness_sigma_m, config.smoothness_weight, config.smoothness_kernel
         terms.append(smoothness(*steps, **energy.linked(sigma, weight, kernel, count)))
-    links = mesh.linked(observed_only=not config.bridge_gaps)
-    count = len(links[0])
+    links, pair = mesh.linked(observed_only=not config.bridge_gaps)
+    twice = config.arap_mutual_pairs == "twice"
+    count = int(mesh.times[pair].sum()) if twice else len(pair)
     if config.arap_weight > 0 and count:
-        terms.append(arap(*links, **energy.linked(config.arap_sigma_m, config.arap_weight, config.arap_kernel, count)))
+        weighed = energy.linked(config.arap_sigma_m, config.arap_weight, config.arap_kernel, count)
+        if twice:
+            weighed["weight"] = weighed["weight"] * mesh.times[pair]
+        terms.append(arap(*links, **weighed))
     return terms
 
 
@@ -199,11 +205,11 @@ def build_mesh(
     points[trajectory, observations.frame] = lifted
     _interpolate(points, exists)
     instance = instance_of_track[tracks]
-    pairs = nearest_neighbors(points, observed, instance, config.neighbors, config.max_neighbor_ratio)
+    pairs, times = nearest_neighbors(points, observed, instance, config.neighbors, config.max_neighbor_ratio)
     trajectory_of, frame_of = np.nonzero(exists)
     track_frame = np.stack([tracks[trajectory_of], frame_of], axis=1)
     state = State({DYNAMIC_POINT: points[exists]}, {DYNAMIC_POINT: track_frame})
-    mesh = PointMesh(tracks, instance, row, observed, pairs)
+    mesh = PointMesh(tracks, instance, row, observed, pairs, times)
     return mesh, observations, row[trajectory, observations.frame], state
 
 
