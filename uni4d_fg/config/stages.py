@@ -291,6 +291,16 @@ class FusionConfig(Section):
         "views; 'nearest_points' corrects every pixel by its nearest control points alone, as what moves is.",
     )
     neighbors: int = setting(3, "Control points per pixel (nearest in 3D, of the pixel's own instance).", ge=1)
+    distance_power: Literal[1, 2] = setting(
+        2,
+        "'nearest_points': a control point weighs by the inverse of this power of its distance: 2 (the reference "
+        "program) or 1 (the paper's text).",
+    )
+    averaged_scale: Literal["log", "linear"] = setting(
+        "log",
+        "'nearest_points': 'log' averages the logarithm of the control points' scales, so that too near and too far "
+        "count alike; 'linear' the scales themselves (the paper's text and the reference program).",
+    )
     smoothing: int = setting(
         16,
         "Each control point's scale is the median over this many nearest control points; 1 keeps it raw.",

@@ -5,8 +5,10 @@ For every pixel x of an instance, with n(x) the nearest control points of that s
     depth(x) = D(x) exp( sum_{i in n(x)} w_i s_i ),   s_i = log z(p_i) - log D(uv_i),   w_i ~ 1 / d_i^2
 
 where d_i is the distance between the lifts of x and of uv_i with the raw cue D (Uni4D, densification; in
-logarithms, and per instance for every instance). A control point's own noise would be copied into the dense
-map, so each s_i is first replaced by the median over its nearest control points.
+logarithms, and per instance for every instance). ``fusion.distance_power`` 1 gives w_i ~ 1 / d_i, as the paper's text
+has it, and ``fusion.averaged_scale`` "linear" the mean of exp(s_i) instead of the exponential of the mean. A control
+point's own noise would be copied into the dense map, so each s_i is first replaced by the median over its nearest
+control points.
 """
 
 from __future__ import annotations
@@ -80,9 +82,13 @@ def densify_frame(
         scale = _smooth(anchors, control.log_scale[mine], config.smoothing)
         pixels = mask == label
         asked = np.where(_around(pixels, nodes.shape[:2])[..., None], nodes, np.nan)
-        field = _interpolate(asked, anchors, scale, frame_log_scale, config.neighbors)
+        linear = config.averaged_scale == "linear"
+        default = frame_log_scale
+        if linear:
+            scale, default = np.exp(scale), float(np.exp(frame_log_scale))
+        field = _interpolate(asked, anchors, scale, default, config.neighbors, config.distance_power)
         dense = cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
-        out[pixels] = depth[pixels] * np.exp(dense[pixels])
+        out[pixels] = depth[pixels] * (dense[pixels] if linear else np.exp(dense[pixels]))
     return out
 
 
@@ -120,10 +126,18 @@ def _smooth(anchors: FloatArray, scale: FloatArray, count: int) -> FloatArray:
     return result
 
 
-def _interpolate(nodes: FloatArray, anchors: FloatArray, scale: FloatArray, default: float, count: int) -> Float32Array:
-    """Interpolate log-scales at nodes (rows, columns, 3) by inverse squared distance, (rows, columns).
+def _interpolate(
+    nodes: FloatArray, anchors: FloatArray, scale: FloatArray, default: float, count: int, power: int
+) -> Float32Array:
+    """Interpolate scales, or their logarithms, at nodes (rows, columns, 3) by inverse distance, (rows, columns).
 
-    Nodes that are NaN have the default.
+    Args:
+        nodes: (rows, columns, 3) m; those that are NaN have the default.
+        anchors: (N, 3) control points, m.
+        scale: (N,) of the control points.
+        default: Where nothing is known.
+        count: Nearest control points of a node, at most.
+        power: Of the distance in the weights, 1 or 2.
     """
     field = np.full(nodes.shape[:2], default)
     known = np.isfinite(nodes).all(axis=-1)
@@ -131,5 +145,7 @@ def _interpolate(nodes: FloatArray, anchors: FloatArray, scale: FloatArray, defa
     distance, index = cKDTree(anchors).query(nodes[known], k=k)
     distance, index = distance.reshape(-1, k), index.reshape(-1, k)
     weight = 1.0 / np.maximum(distance**2, _MIN_SQUARED_DISTANCE)
+    if power == 1:
+        weight = np.sqrt(weight)
     field[known] = np.sum(weight * scale[index], axis=1) / np.sum(weight, axis=1)
     return field.astype(np.float32)
