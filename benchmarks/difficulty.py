@@ -130,7 +130,7 @@ _ABLATED = [
 
 
 def ablations() -> list[Configuration]:
-    """Return the rows of ``uni4d-fg ablate``."""
+    """Return the rows of ``uni4d-fg ablate --rows paper``."""
     return configurations(list(PAPER.items()), {"set": list(_BARE)}, "difficulty")
 
 

@@ -155,13 +155,17 @@ def ablate(
     dataset: DatasetName,
     root: Root = None,
     grid: Annotated[
-        Path | None, typer.Argument(metavar="[GRID.yaml]", help="Rows; the paper's ablations if not given.")
+        Path | None, typer.Argument(metavar="[GRID.yaml]", help="Rows; those of --rows if not given.")
     ] = None,
     out: Out = Path("runs/ablation"),
     split: Split = None,
     videos: Videos = None,
     cues: Cues = None,
     changes: options.Overrides = None,
+    ready: Annotated[
+        str | None,
+        typer.Option("--rows", metavar="paper|standard|full", help="Rows without a file; 'standard' if not given."),
+    ] = None,
     protocols: Protocols = None,
     max_size: MaxSize = None,
     fresh: Fresh = False,
@@ -173,13 +177,17 @@ def ablate(
     quiet: options.Quiet = False,
 ) -> None:
     """Compare configurations on a dataset: terms, cues, solver, preset; cameras are scored after every stage too."""
-    from uni4d_fg.pipeline.benchmark.grid import PAPER, configurations, read_grid
+    from uni4d_fg.pipeline.benchmark.grid import read_grid, ready_made
     from uni4d_fg.pipeline.workers.options import WorkerOptions
 
-    if grid is not None and changes:
-        raise ConfigError("--set changes the paper's ablations; a grid has a base for what its rows share")
-    base = {"set": list(changes or ())}
-    rows = read_grid(grid) if grid is not None else configurations(list(PAPER.items()), base, "ablate")
+    if grid is not None and (changes or ready):
+        raise ConfigError("--set and --rows are for rows without a file; a grid has a base for what its rows share")
+    if grid is not None:
+        rows = read_grid(grid)
+    else:
+        rows, missing = ready_made(ready or "standard", {"set": list(changes or ())})
+        if missing:
+            typer.echo(f"left out, for `pip install 'uni4d-fg[adam]'`: {'; '.join(missing)}", err=True)
     _experiment(
         dataset, root, out, split, videos, cues, rows, None, protocols, False, max_size, fresh, False, quiet,
         WorkerOptions(workers, scheduler, threads, 60.0 * time_limit, retries),

@@ -211,6 +211,21 @@ def test_a_wrong_command_is_explained(
     assert (found, message in err) == (code, True), err
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["sintel", "--rows", "most"], "choose one of paper, standard, full"),
+        (["sintel", "grid.yaml", "--rows", "full"], "--set and --rows are for rows without a file"),
+        (["sintel", "grid.yaml", "--set", "output.clouds=false"], "--set and --rows are for rows without a file"),
+    ],
+)
+def test_rows_of_ablations_are_ready_made_or_from_a_file(
+    words: list[str], message: str, root: Path, cli: Run, tmp_path: Path
+) -> None:
+    code, _, err = cli("ablate", *words, "--root", root, "--out", tmp_path)
+    assert (code, message in err) == (2, True), err
+
+
 def test_synthetic_scenes_need_no_folder_and_other_datasets_say_that_they_do(
     cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from pathlib import Path
 
 import pytest
 
+from uni4d_fg.config.load import load_config
 from uni4d_fg.errors import ConfigError
-from uni4d_fg.pipeline.benchmark.grid import PAPER, configurations, read_grid
+from uni4d_fg.pipeline.benchmark.grid import PAPER, READY_MADE, configurations, read_grid, ready_made
 from uni4d_fg.pipeline.benchmark.published import read_published
 from uni4d_fg.pipeline.benchmark.short import short_table
 from uni4d_fg.pipeline.benchmark.table import Column, Row, Table, latex_text
@@ -181,6 +183,51 @@ def test_a_wrong_grid_is_named(text: str, message: str, tmp_path: Path) -> None:
 
 def test_the_papers_ablations_are_valid() -> None:
     assert len(configurations(list(PAPER.items()), {}, "ablate")) == len(PAPER)
+
+
+@pytest.mark.parametrize("name", READY_MADE)
+def test_every_row_that_is_ready_made_is_another_way_to_run(name: str) -> None:
+    rows, missing = ready_made(name, {"set": ["output.pictures=false"]})
+    assert ([row.name for row in rows], missing) == (list(READY_MADE[name]), [])
+    ways = {
+        json.dumps([
+            load_config(row.preset, row.changes).model_dump(mode="json"),
+            row.intrinsics, row.depth, row.masks, row.tracks, row.poses,
+        ])
+        for row in rows
+    }  # fmt: skip
+    assert len(ways) == len(rows)
+    assert all("output.pictures=false" in row.changes for row in rows)
+
+
+def test_the_full_rows_vary_terms_cues_solver_and_preset() -> None:
+    rows = {row.name: row for row in ready_made("full", {})[0]}
+    configs = {name: load_config(row.preset, row.changes) for name, row in rows.items()}
+    assert {(row.preset, configs[name].solver) for name, row in rows.items()} >= {
+        ("default", "lm"), ("default", "adam"), ("paper", "lm"), ("paper", "adam"), ("fast", "lm"),
+    }  # fmt: skip
+    assert {row.masks for row in rows.values()} == {"cue", "true", "motion", "none"}
+    assert {row.tracks for row in rows.values()} == {"cue", "built_in"}
+    assert {row.depth for row in rows.values()} == {"cue", "motion"}
+    acceleration = configs["without E_cam"].bundle_adjustment.acceleration
+    assert (acceleration.linear, acceleration.angular) == (None, None)
+    text = configs["preset paper, formulas of the text"]
+    assert (text.camera_init.kernel.kind, text.normalization, text.fusion.distance_power) == ("quadratic", "sum", 1)
+
+
+def test_no_row_by_adam_is_run_unasked_or_without_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert all(load_config(r.preset, r.changes).solver == "lm" for r in ready_made("standard", {})[0])
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    rows, missing = ready_made("full", {})
+    assert missing == ["Adam", "preset paper, Adam"]
+    assert len(rows) == len(READY_MADE["full"]) - 2
+
+
+def test_a_list_of_rows_that_is_not_there_and_a_change_that_a_row_refuses_are_named() -> None:
+    with pytest.raises(ConfigError, match="--rows most: choose one of paper, standard, full"):
+        ready_made("most", {})
+    with pytest.raises(ConfigError, match=r"--rows standard: preset paper: .*arap_kernel\.kind=cauchy"):
+        ready_made("standard", {"set": ["nonrigid.arap_kernel.kind=cauchy"]})
 
 
 def test_a_stored_result_counts_only_for_its_own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,10 +8,13 @@ rows:
 grid:
   solver: [lm, adam]          # fields of the configuration, or preset, intrinsics, depth, masks, tracks, poses
   preset: [default, paper]
+
+Three lists of rows are ready made, see :data:`READY_MADE`.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import math
 from pathlib import Path
@@ -38,7 +41,43 @@ PAPER: dict[str, dict[str, Any]] = {
     "no masks": {"masks": "none"},
     "depth from motion": {"depth": "motion"},
 }
-"""The rows of ``uni4d-fg ablate`` without a file: the paper's ablations as far as no other network is needed."""
+"""The paper's ablations as far as no other network is needed."""
+
+_STANDARD: dict[str, dict[str, Any]] = {
+    **PAPER,
+    "without E_cam": {
+        "set": ["bundle_adjustment.acceleration.linear=null", "bundle_adjustment.acceleration.angular=null"]
+    },
+    "preset paper": {"preset": "paper"},
+}
+
+READY_MADE: dict[str, dict[str, dict[str, Any]]] = {
+    "paper": PAPER,
+    "standard": _STANDARD,
+    "full": {
+        **_STANDARD,
+        "without the depth prior": {
+            "set": ["bundle_adjustment.depth_prior=false", "nonrigid.depth_prior=false"],
+        },
+        "true masks": {"masks": "true"},
+        "preset fast": {"preset": "fast"},
+        "preset paper, formulas of the text": {
+            "preset": "paper",
+            "set": [
+                "normalization=sum",
+                "camera_init.kernel={kind: quadratic}",
+                "camera_init.camera_motion={rotation_weight: 0, translation_weight: 0}",
+                "bundle_adjustment.camera_motion.translation_axes=camera",
+                "fusion.distance_power=1",
+                "fusion.averaged_scale=linear",
+            ],
+        },
+        "Adam": {"set": ["solver=adam"]},
+        "preset paper, Adam": {"preset": "paper", "set": ["solver=adam"]},
+    },
+}
+"""Rows by the name that ``uni4d-fg ablate --rows`` takes, 'standard' if not given. Adam, which needs PyTorch and takes
+minutes a video, is in the last list only."""
 
 _MOST_ROWS = 500
 
@@ -91,6 +130,24 @@ def read_grid(path: Path) -> list[Configuration]:
         if values:
             named.append(_combination(dict(zip(found.grid, values, strict=True))))
     return configurations(named, found.base, str(path))
+
+
+def ready_made(name: str, base: dict[str, Any]) -> tuple[list[Configuration], list[str]]:
+    """Return the configurations of a ready-made list, and the names of those that are left out without PyTorch.
+
+    Raises:
+        ConfigError: If there is no such list, or what ``base`` changes does not go with one of its rows.
+    """
+    if name not in READY_MADE:
+        raise ConfigError(f"--rows {name[:60]}: choose one of {', '.join(READY_MADE)}, or give a file with rows")
+    rows = configurations(list(READY_MADE[name].items()), base, f"--rows {name}")
+    if importlib.util.find_spec("torch") is not None:
+        return rows, []
+    return [r for r in rows if not _by_adam(r)], [r.name for r in rows if _by_adam(r)]
+
+
+def _by_adam(row: Configuration) -> bool:
+    return load_config(row.preset, row.changes).solver == "adam"
 
 
 def configurations(named: list[tuple[str, dict[str, Any]]], base: dict[str, Any], where: str) -> list[Configuration]:
