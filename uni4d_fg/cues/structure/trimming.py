@@ -41,6 +41,8 @@ def trim(scene: GrowingScene) -> None:
     settings = scene.config.geometric_depth
     limit = scene.limit_px
     for _ in range(settings.trim_rounds):
+        if not np.isfinite(scene.position).any():
+            return
         noise, before = _noise(scene), limit
         limit = np.clip(settings.trim_sigmas * noise, settings.min_trim_px, settings.max_reprojection_px)
         left_out = _disagreeing(scene, limit)
@@ -68,8 +70,6 @@ def _noise(scene: GrowingScene) -> FloatArray:
     """
     error, seen = _seen(scene)
     frame = scene.observations.frame
-    if not seen.any():
-        return np.zeros(len(scene.registered))
     every = float(np.median(error[seen]))
     own = np.full(len(scene.registered), every)
     for t in np.unique(frame[seen]).tolist():

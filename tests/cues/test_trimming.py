@@ -1,0 +1,127 @@
+"""Cameras that come loose from what moves by a little, and what is then known to move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cues.start_scenes import SIZE, K, TrackedScene, sideways
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.progress import SilentReporter
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+from uni4d_fg.slam.stages.observations import Observations
+
+FRAMES, ROOM, BODY = 20, 220, 110
+NOISE_PX = 0.1
+
+
+def swaying(seed: int, noise_px: float = NOISE_PX) -> TrackedScene:
+    """A room, and a body of a third of the tracks that drifts and bends by little from frame to frame."""
+    rng = np.random.default_rng(seed)
+    poses = sideways(FRAMES)
+    poses[:, :3, 3] *= 0.3
+    room = np.stack([rng.uniform(-2, 3, ROOM), rng.uniform(-2, 2, ROOM), rng.uniform(2.5, 6.0, ROOM)], axis=1)
+    body = rng.uniform([-0.5, -0.7, 1.6], [0.5, 0.7, 2.0], (BODY, 3))
+    rows = []
+    for frame, pose in enumerate(poses):
+        part = frame / (FRAMES - 1)
+        bend = 0.3 * np.sin(2.0 * np.pi * part) * body[:, 1:2] ** 2 * np.array([1.0, 0.3, 0.0])
+        points = np.concatenate([room, body + bend + part * np.array([0.15, 0.02, 0.0])])
+        uv = project(K, world_to_camera(pose, points)) + rng.normal(0, noise_px, (ROOM + BODY, 2))
+        seen = np.flatnonzero((uv > 0).all(axis=1) & (uv[:, 0] < SIZE[1]) & (uv[:, 1] < SIZE[0]))
+        rows.append((seen, np.full(len(seen), frame), uv[seen]))
+    track, frame_of, uv = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    order = np.lexsort([frame_of, track])
+    count = len(track)
+    observations = Observations(
+        track[order].astype(np.int64), frame_of[order].astype(np.int64), uv[order], np.full(count, np.nan),
+        np.ones(count),
+    )  # fmt: skip
+    return TrackedScene(observations.with_min_observations(5), poses, np.arange(ROOM + BODY) >= ROOM)
+
+
+def solved(scene: TrackedScene, *changes: str) -> tuple[Structure, float, float]:
+    """The structure, its ATE as a part of the path's extent, and how far its focal length is off."""
+    config = load_config("default", list(changes))
+    structure = structure_from_motion(
+        scene.observations, FRAMES, SIZE, K * np.array([1.2, 1.2, 1.0, 1.0]), config, SilentReporter(), lambda: False
+    )
+    assert structure is not None
+    extent = np.linalg.norm(np.ptp(scene.world_T_cam[:, :3, 3], axis=0))
+    ate = evaluate_trajectory(structure.world_T_cam, scene.world_T_cam).ate_m / float(extent)
+    return structure, ate, abs(float(structure.intrinsics[0]) / K[0] - 1.0)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_third_that_moves_by_a_little_does_not_bend_the_cameras(seed: int) -> None:
+    scene = swaying(seed)
+    assert scene.moves[scene.observations.track].mean() > 0.3
+    _, bent, _ = solved(scene, "geometric_depth.trim_rounds=0")
+    structure, ate, focal = solved(scene)
+    assert ate < 0.45 * bent
+    assert ate < 0.006
+    assert focal < 0.02
+    moves = scene.moves[structure.track]
+    assert structure.moving[moves].mean() > 0.6  # what hardly bends agrees with a static point
+    assert structure.moving[~moves].mean() < 0.02
+    assert not np.isfinite(structure.points.position[structure.moving]).any()
+
+
+@pytest.mark.parametrize("noise_px", [0.1, 0.5])
+def test_nothing_is_left_out_where_nothing_moves(noise_px: float) -> None:
+    scene = swaying(3, noise_px)
+    still = scene.observations.select(~scene.moves[scene.observations.track])
+    structure, ate, _ = solved(replace(scene, observations=still))
+    _, before, _ = solved(replace(scene, observations=still), "geometric_depth.trim_rounds=0")
+    assert ate < 1.1 * before
+    assert structure.moving.mean() < 0.01
+    assert np.isfinite(structure.points.position[:, 0]).mean() > 0.97
+
+
+def posed(scene: TrackedScene) -> GrowingScene:
+    """A scene with the true cameras and all points."""
+    grown = GrowingScene.empty(
+        scene.observations, FRAMES, K, load_config("default"), free_focal=True, prior_intrinsics=K,
+        should_stop=lambda: False,
+    )  # fmt: skip
+    grown.world_T_cam, grown.registered = scene.world_T_cam.copy(), np.ones(FRAMES, dtype=bool)
+    grown.triangulate_all()
+    return grown
+
+
+def test_a_blurred_frame_has_a_limit_of_its_own(rng: np.random.Generator) -> None:
+    scene = swaying(4)
+    still = scene.observations.select(~scene.moves[scene.observations.track])
+    blurred = still.frame == 7
+    still.uv[blurred] += rng.normal(0, 0.8, (int(blurred.sum()), 2))
+    grown = posed(replace(scene, observations=still))
+    trim(grown)
+    usual = np.delete(grown.limit_px, 7)
+    assert np.all(usual < 1.0)
+    assert grown.limit_px[7] > 3.0 * usual.max()
+    assert grown.good[blurred].mean() > 0.95
+    assert not grown.left_out.any()
+
+
+def test_tracks_that_are_left_out_come_back_when_they_agree() -> None:
+    scene = swaying(5)
+    grown = posed(scene)
+    grown.leave_out(~scene.moves[scene.observations.rows()[0]], grown.limit_px)  # the wrong ones
+    trim(grown)
+    moves = scene.moves[scene.observations.rows()[0]]
+    assert grown.left_out[~moves].mean() < 0.02
+    assert grown.left_out[moves].mean() > 0.25
+
+
+def test_without_points_nothing_is_trimmed() -> None:
+    scene = swaying(6)
+    empty = posed(scene)
+    empty.position[:] = np.nan
+    trim(empty)
+    assert not empty.left_out.any()
