@@ -26,7 +26,12 @@ from uni4d_fg.cues.interpolated_depth import (
 )
 from uni4d_fg.cues.moving_things import Sightings, place_moving
 from uni4d_fg.cues.start_doubts import start_doubts, start_summary
-from uni4d_fg.cues.structure.motion import Structure, rotations_only, structure_from_motion
+from uni4d_fg.cues.structure.motion import (
+    Structure,
+    observations_of_tracks,
+    rotations_only,
+    structure_from_motion,
+)
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
@@ -101,7 +106,7 @@ def depth_from_motion(
             f"depth from motion: {tracks.num_tracks} tracks over {tracks.num_frames} frames and is_static "
             f"{is_static.shape} do not fit {video.num_frames} frames; give one flag per track of this video"
         )
-    observations = _static_observations(tracks, is_static)
+    observations = observations_of_tracks(tracks, is_static)
     if len(np.unique(observations.track)) < config.geometric_depth.min_pose_points:
         raise DegenerateProblemError(
             f"depth from motion: only {len(np.unique(observations.track))} tracks are static. Check the masks (is "
@@ -113,15 +118,6 @@ def depth_from_motion(
     if structure is None:
         return _without_parallax(video, tracks, is_static, observations, intrinsics, config.geometric_depth)
     return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
-
-
-def _static_observations(tracks: Tracks, is_static: BoolArray) -> Observations:
-    track, frame = np.nonzero(tracks.visible & is_static[:, None])
-    uv = tracks.uv[track, frame].astype(np.float64)
-    observations = Observations(
-        track.astype(np.int64), frame.astype(np.int64), uv, np.full(len(track), np.nan), np.ones(len(track))
-    )
-    return observations.with_min_observations(2)
 
 
 def _with_maps(

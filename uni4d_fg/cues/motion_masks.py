@@ -1,7 +1,8 @@
 """Masks of what moves, from tracks, depth and images alone: for videos without a segmenter.
 
-1. Cameras are solved from all tracks, robustly; tracks that depart from the static scene are found
-   (:mod:`uni4d_fg.cues.track_motion`); cameras are solved once more without them, and the tracks tested again.
+1. Tracks that contradict a static scene by themselves are known (:mod:`uni4d_fg.cues.structure`). Cameras are solved
+   from the others, robustly; tracks that depart from the static scene are found (:mod:`uni4d_fg.cues.track_motion`);
+   cameras are solved once more without them, and the tracks tested again.
 2. Every frame is compared with others before and after it as a static scene would look there
    (:mod:`uni4d_fg.cues.appearance`). Of the two directions the less suspicious one counts: what is hidden in one is
    mostly seen in the other.
@@ -35,6 +36,7 @@ from uni4d_fg.cues.moving_regions import moving_region, track_evidence, trusted_
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.static_scene import relative_pose
+from uni4d_fg.cues.structure.motion import observations_of_tracks, structure_from_motion
 from uni4d_fg.cues.track_motion import QuadraticGrid, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
@@ -83,7 +85,8 @@ def motion_masks(
         reporter: Progress.
         should_stop: Polled often.
         solver: Stages 1 and 2 and their minimizer; None takes the defaults.
-        known_moving: (K,) tracks that are known to move, if any are.
+        known_moving: (K,) tracks that are known to contradict a static scene; None lets them be found from the tracks
+            alone (:mod:`uni4d_fg.cues.structure`), as a thing that moves by little stays within the sigmas of depth.
 
     Raises:
         InputError: If depth or tracks do not fit the images, or depth is missing wherever there is a track.
@@ -96,6 +99,8 @@ def motion_masks(
         if count != video.num_frames:
             raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
+    if known_moving is None:
+        known_moving = _contradicting(tracks, video.image_size, intrinsics, settings, report, stop)
     report.begin("motion of tracks", config.camera_rounds)
     cameras, motion = _tracks_and_cameras(
         video, depths, tracks, intrinsics, known_moving, config, settings, report, stop
@@ -140,7 +145,7 @@ def _tracks_and_cameras(
     depths: FrameSource[Float32Array],
     tracks: Tracks,
     intrinsics: FloatArray,
-    known_moving: BoolArray | None,
+    known_moving: BoolArray,
     config: MotionMaskConfig,
     settings: Config,
     report: Reporter,
@@ -155,8 +160,7 @@ def _tracks_and_cameras(
         )
     spread = spread_at_tracks(known.labelled.tracks, depths, max(1, round(config.depth_edge_px)))
     outlier = find_outlier_tracks(known.labelled, intrinsics, config)
-    if known_moving is not None:
-        outlier = outlier | known_moving
+    outlier |= known_moving
     moving = outlier
     cameras, motion = None, None
     for turn in range(config.camera_rounds):
@@ -177,6 +181,23 @@ def _tracks_and_cameras(
     assert cameras is not None
     assert motion is not None
     return cameras, motion
+
+
+def _contradicting(
+    tracks: Tracks, image_size: tuple[int, int], intrinsics: FloatArray, settings: Config, report: Reporter,
+    stop: Callable[[], bool],
+) -> BoolArray:  # fmt: skip
+    """Return which tracks (K,) contradict a static scene, whatever their depth; none without parallax to see it by."""
+    out = np.zeros(tracks.num_tracks, dtype=bool)
+    seen = observations_of_tracks(tracks, ~out)
+    if len(np.unique(seen.track)) < settings.geometric_depth.min_pose_points:
+        return out
+    found = structure_from_motion(
+        seen, tracks.num_frames, image_size, intrinsics, settings, report, stop, with_doubts=False
+    )
+    if found is not None:
+        out[found.track] = found.moving
+    return out
 
 
 class _Comparison:

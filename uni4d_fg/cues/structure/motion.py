@@ -22,6 +22,7 @@ from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
 from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled
+from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -53,6 +54,16 @@ class Structure:
     :func:`~uni4d_fg.cues.structure.judging.unexplained`."""
     rivals: list[Rival]
     """Starts that explain them nearly as well."""
+
+
+def observations_of_tracks(tracks: Tracks, which: BoolArray) -> Observations:
+    """Return what is seen of some tracks (K,) at least twice, without depth."""
+    track, frame = np.nonzero(tracks.visible & which[:, None])
+    uv = tracks.uv[track, frame].astype(np.float64)
+    observations = Observations(
+        track.astype(np.int64), frame.astype(np.int64), uv, np.full(len(track), np.nan), np.ones(len(track))
+    )
+    return observations.with_min_observations(2)
 
 
 def structure_from_motion(
