@@ -106,7 +106,7 @@ def main() -> None:
     out = asked.out.resolve()
     levels = list({level.name: level for axis in AXES.values() for level in axis}.values())
     root = make_scenes(out / "scenes", [*levels, *_ABLATED])
-    tasks = [task(root, out, level, method) for method in METHODS for level in levels if belongs(level, method)]
+    tasks = [task(root, out, level, method) for method in METHODS for level in levels]
     tasks += [task(root, out, level, method) for level in _ABLATED for method in ablations()]
     wanted = [
         t
@@ -132,11 +132,6 @@ _ABLATED = [
 def ablations() -> list[Configuration]:
     """Return the rows of ``uni4d-fg ablate --rows paper``."""
     return configurations(list(PAPER.items()), {"set": list(_BARE)}, "difficulty")
-
-
-def belongs(level: Level, method: Configuration) -> bool:
-    """Tell whether a method is run on a scene: Adam on those of given tracks, which it shares with the others."""
-    return not level.built_in or "solver=adam" not in method.changes
 
 
 def make_scenes(root: Path, levels: Sequence[Level]) -> Path:
