@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import miniatures
 import numpy as np
@@ -27,6 +28,8 @@ from uni4d_fg.pipeline.benchmark.grid import read_grid
 from uni4d_fg.pipeline.benchmark.methods import read_method
 from uni4d_fg.pipeline.benchmark.methods.exr import read_exr
 from uni4d_fg.pipeline.benchmark.published import FILE, read_published
+from uni4d_fg.pipeline.benchmark.score import NO_MASKS
+from uni4d_fg.pipeline.benchmark.tables import Method
 from uni4d_fg.pipeline.benchmark.task import Configuration, Task
 
 hostile = settings(settings.get_profile("hostile"))
@@ -110,13 +113,11 @@ def sample_video() -> Video:
     )  # fmt: skip
 
 
-class OneVideo:
-    """A dataset of one video in memory."""
-
-    card = find_dataset("sintel").card
-
-    def open(self, root: Path, video: str) -> Video:
-        return sample_video()
+def read(text: str, folder: Path, depth_protocols: tuple[str, ...]) -> Method:
+    """Read what another program wrote about a dataset of one video in memory."""
+    task = Task("sintel", str(folder), "v", Configuration("x"), str(folder), None, None, ("sim3",), depth_protocols)
+    with patch("uni4d_fg.pipeline.benchmark.methods.open_task", lambda task: sample_video()):
+        return read_method(text, [task], lambda task: (None, NO_MASKS))
 
 
 @hostile
@@ -138,7 +139,7 @@ def test_outputs_of_other_programs(tmp_path_factory: pytest.TempPathFactory, dat
             np.savez(path, **arrays)
         else:
             path.write_bytes(data.draw(damaged(path.read_bytes())))
-    judged(read_method, f"{layout}:theirs={folder}", OneVideo(), folder, ("v",), ("sim3",), ("metric", "uni4d-scale"))
+    judged(read, f"{layout}:theirs={folder}", folder, ("metric", "uni4d-scale"))
 
 
 def test_depth_of_another_size_in_one_frame_costs_that_video_only(tmp_path: Path) -> None:
@@ -147,7 +148,7 @@ def test_depth_of_another_size_in_one_frame_costs_that_video_only(tmp_path: Path
     with np.load(path) as stored:
         arrays = dict(stored)
     np.savez(path, **{**arrays, "disp": arrays["disp"][:-1]})
-    found = judged(read_method, f"uni4d={tmp_path}", OneVideo(), tmp_path, ("v",), ("sim3",), ())
+    found = judged(read, f"uni4d={tmp_path}", tmp_path, ())
     assert "maps of one size" in str(found.results["v"].failed)
 
 
