@@ -214,7 +214,7 @@ _HEAD = (
     "(0.5 px, depth flicker 4 %, smooth depth error 2 %, outliers 2 %, focal length 5 % off), one difficulty each.",
     "They are this small because Adam takes minutes for larger ones. The path of the camera is 0.3 m long at 15 frames",
     "a second, too short to lay the worlds on each other by it: moving points are compared with the first cameras laid",
-    "on each other, in the meters of the depth cue. An empty cell was not run (Adam has no tracker of its own); a dash",
+    "on each other, in the meters of the depth cue. An empty cell was not run; a dash",
     "is where there is no truth to compare with. More on recordings with truth is in [results.md](results.md), on Adam",
     "in [comparison.md](comparison.md).",
     "",
