@@ -14,7 +14,7 @@ from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
-from uni4d_fg.pipeline.steps import correct_cue, frozen_cameras, scene_arrays, stop_if_cancelled
+from uni4d_fg.pipeline.steps import correct_cue, frozen_cameras, landmark_observations, scene_arrays, stop_if_cancelled
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.slam.reconstruction import OBJECT_ARRAYS
@@ -79,8 +79,7 @@ def joint_step(
 
 def static_scene(labelled: LabelledTracks, scene: Arrays, config: Config) -> StaticScene:
     """Return the end of stage 2 from its record, with all observations of the landmarks it kept."""
-    observations = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
-    observations = observations.select(np.isin(observations.track, scene["landmark_track"]))
+    observations, _ = landmark_observations(labelled, scene)
     if energy_of(config).is_likelihood:
         drift = config.bundle_adjustment.drift_frames
         observations = weigh_by_drift(observations, labelled.tracks.query_frame, drift)

@@ -304,7 +304,7 @@ def correct_cue(
     """Scale the cue at dynamic observations by what the static scene around them says."""
     if not energy_of(config).is_likelihood or len(observations) == 0 or len(scene["landmarks"]) == 0:
         return observations, cameras, noise, []
-    static, row = _landmark_observations(labelled, scene)
+    static, row = landmark_observations(labelled, scene)
     z = world_to_camera(cameras.world_T_cam[static.frame], scene["landmarks"][row])[:, 2]
     measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
     neighbors, samples = config.nonrigid.local_scale_neighbors, config.nonrigid.local_scale_samples
@@ -321,7 +321,7 @@ def _noise_of_lift(
     """Measure what the proximal term of the paper's energy is in units of, if it is asked for."""
     if config.nonrigid.proximal_weight == 0 or len(scene["landmarks"]) == 0:
         return None, []
-    static, row = _landmark_observations(labelled, scene)
+    static, row = landmark_observations(labelled, scene)
     noise = lift_noise(static, scene["landmarks"][row], cameras)
     if noise is None:
         return None, []
@@ -329,7 +329,7 @@ def _noise_of_lift(
     return replace(noise, sigma=max(noise.sigma, config.bundle_adjustment.min_depth_sigma)), [fact]
 
 
-def _landmark_observations(labelled: LabelledTracks, scene: Arrays) -> tuple[Observations, IntArray]:
+def landmark_observations(labelled: LabelledTracks, scene: Arrays) -> tuple[Observations, IntArray]:
     """Return all observations of the landmarks of a stage 2 record, and the landmark of each."""
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
     static = static.select(np.isin(static.track, scene["landmark_track"]))

@@ -134,7 +134,7 @@ class GrowingScene:
         """Take the cameras of a scene of the same frames, and triangulate what they see."""
         self.world_T_cam, self.registered = other.world_T_cam.copy(), other.registered.copy()
         self.intrinsics = other.intrinsics.copy()
-        self.triangulate(np.ones(self.num_tracks, dtype=bool))
+        self.triangulate_all()
 
     def triangulate(self, which: BoolArray, posed: int | None = None) -> None:
         """Triangulate tracks (M,) from the frames that have a pose; what does not fit stays without a point.

@@ -15,6 +15,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.triangulation import median_per_row
 
 _MEDIAN_OF_NORM = 1.1774
 """Median length of a plane vector with normal components of variance 1."""
@@ -43,9 +44,10 @@ def trim(scene: GrowingScene) -> None:
     for _ in range(settings.trim_rounds):
         if not np.isfinite(scene.position).any():
             return
-        noise, before = _noise(scene), limit
-        limit = np.clip(settings.trim_sigmas * noise, settings.min_trim_px, settings.max_reprojection_px)
-        left_out = _disagreeing(scene, limit)
+        error, before = scene.errors(), limit
+        limit = settings.trim_sigmas * _noise(scene, error)
+        limit = np.clip(limit, settings.min_trim_px, settings.max_reprojection_px)
+        left_out = _disagreeing(scene, error, limit)
         settled = float(np.abs(np.log(limit / before)).max()) < _SETTLED and not (left_out & ~scene.left_out).any()
         scene.leave_out(left_out, limit)
         if settled:
@@ -54,32 +56,27 @@ def trim(scene: GrowingScene) -> None:
         scene.adjust()
         scene.triangulate_all()
     limit = np.minimum(_WIDEN * limit, settings.max_reprojection_px)
-    scene.leave_out(_disagreeing(scene, limit), limit)
+    scene.leave_out(_disagreeing(scene, scene.errors(), limit), limit)
 
 
-def _seen(scene: GrowingScene) -> tuple[FloatArray, BoolArray]:
-    """Return the error (N,) px of every observation, and which have a point and a camera."""
-    error = scene.errors()
-    return error, scene.registered[scene.observations.frame] & np.isfinite(error)
-
-
-def _noise(scene: GrowingScene) -> FloatArray:
-    """Return the noise of a component of the observations in each frame (T,), px, by medians.
+def _noise(scene: GrowingScene, error: FloatArray) -> FloatArray:
+    """Return the noise of a component of the observations in each frame (T,), px, by medians of the errors (N,).
 
     That of all observations, or of a frame that has more: what is blurred or turned fast is not to lose its camera.
     """
-    error, seen = _seen(scene)
-    frame = scene.observations.frame
-    every = float(np.median(error[seen]))
-    own = np.full(len(scene.registered), every)
-    for t in np.unique(frame[seen]).tolist():
-        own[t] = np.median(error[seen & (frame == t)])
-    return np.asarray(np.maximum(own, every) / _MEDIAN_OF_NORM)
+    seen, frame = _seen(scene, error), scene.observations.frame
+    own = median_per_row(error[seen], frame[seen], len(scene.registered))
+    return np.asarray(np.fmax(own, np.median(error[seen])) / _MEDIAN_OF_NORM)
 
 
-def _disagreeing(scene: GrowingScene, limit_px: FloatArray) -> BoolArray:
-    """Return the tracks (M,) of which most observations are beyond the limits (T,)."""
-    error, seen = _seen(scene)
+def _disagreeing(scene: GrowingScene, error: FloatArray, limit_px: FloatArray) -> BoolArray:
+    """Return the tracks (M,) of which most observations, with errors (N,), are beyond the limits (T,)."""
+    seen = _seen(scene, error)
     count = np.bincount(scene.row[seen], minlength=scene.num_tracks)
     beyond = np.bincount(scene.row[seen], (error > limit_px[scene.observations.frame])[seen], scene.num_tracks)
     return np.asarray(beyond > _MOST * count)
+
+
+def _seen(scene: GrowingScene, error: FloatArray) -> BoolArray:
+    """Return which observations (N,) have a point and a camera."""
+    return np.asarray(scene.registered[scene.observations.frame] & np.isfinite(error))
