@@ -29,6 +29,12 @@ def evenly_spread(count: int, limit: int) -> IntArray:
     return np.linspace(0, count - 1, min(count, limit)).astype(np.int64)
 
 
+def rows_by_group(group: npt.NDArray[np.integer], count: int) -> list[IntArray]:
+    """Return the rows, ascending, of each of the groups 0 .. count - 1 of values (N,)."""
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(group, minlength=count)[: count - 1]))
+
+
 def sum_rows(values: FloatArray, row: IntArray, count: int) -> FloatArray:
     """Return the sums (count, ...) of the values (N, ...) of each row (N,); 0 for a row without any."""
     columns = int(np.prod(values.shape[1:]))

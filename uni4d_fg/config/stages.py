@@ -159,6 +159,12 @@ class BundleAdjustmentConfig(Section):
         ge=0,
         le=64,
     )
+    max_camera_observations: int = setting(
+        2_000_000,
+        "Of more observations than this the camera solves of 'map' take evenly spread tracks with about as many; the "
+        "other landmarks are refined with the cameras held (structure: refine). Bounds memory and time.",
+        ge=100,
+    )
     structure: Literal["refine", "relift", "keep"] = setting(
         "refine",
         "Landmarks after the solve. 'refine': solve them and the frames' scales once more with frozen cameras and "

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray, rows_by_group
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.interpolated_depth import (
@@ -183,10 +183,11 @@ def _normalize(structure: Structure, observations: Observations, median_depth: f
 def _inverse_depths(structure: Structure, observations: Observations, config: GeometricDepthConfig) -> FloatArray:
     """Return the inverse depth of every observation's point in its frame, (N,); NaN where poorly known."""
     row = np.searchsorted(structure.track, observations.track)
-    has_row = np.isin(observations.track, structure.track)
+    known = np.flatnonzero(np.isin(observations.track, structure.track))
+    known_in = rows_by_group(observations.frame[known], len(structure.world_T_cam))
 
     def of_frame(frame: int) -> tuple[IntArray, FloatArray]:
-        mine = np.flatnonzero((observations.frame == frame) & has_row)
+        mine = known[known_in[frame]]
         pose, rows = structure.world_T_cam[frame], row[mine]
         position = structure.points.position[rows]
         x = world_to_camera(pose, position)
@@ -214,11 +215,9 @@ def _points_per_frame(
     observations: Observations, inverse: FloatArray, num_frames: int, config: GeometricDepthConfig
 ) -> tuple[SparseInverseDepth, ...]:
     """Return the points to interpolate in every frame; one without any takes those of the nearest frame."""
-    known = np.isfinite(inverse)
-    found: list[SparseInverseDepth] = []
-    for frame in range(num_frames):
-        mine = known & (observations.frame == frame)
-        found.append(SparseInverseDepth(observations.uv[mine], inverse[mine]))
+    known = np.flatnonzero(np.isfinite(inverse))
+    rows = [known[rows] for rows in rows_by_group(observations.frame[known], num_frames)]
+    found = [SparseInverseDepth(observations.uv[mine], inverse[mine]) for mine in rows]
     filled = np.array([len(points.inverse_depth) >= config.min_interpolated_points for points in found])
     if not filled.any():
         everywhere = SparseInverseDepth(np.zeros((1, 2)), np.array([1.0 / config.median_depth]))

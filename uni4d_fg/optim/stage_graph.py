@@ -67,12 +67,14 @@ class RecordingRunner:
     """A ``StageRunner`` that remembers the last solve of every kind."""
 
     run: StageRunner
+    kinds: frozenset[str] | None = None
+    """Kinds that are remembered; all when None."""
     solved: dict[str, StageGraph] = field(default_factory=dict)
 
     def __call__(self, stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
         """Solve a stage."""
         self.solved.pop(stage.kind, None)  # not while another is made: of a long video each is hundreds of MB
         final, summary = self.run(stage, state, hooks)
-        if stage.reads_free_variables:
+        if stage.reads_free_variables and (self.kinds is None or stage.kind in self.kinds):
             self.solved[stage.kind] = StageGraph(stage.kind, stage.problem, state, final)
         return final, summary

@@ -19,6 +19,9 @@ _KINDS = {
 }
 """Kinds of solves that a step of the pipeline makes; in windows, stage 1 is part of bundle adjustment."""
 
+KEPT = frozenset(kind for kinds in _KINDS.values() for kind in kinds)
+"""Kinds of solves whose graphs a run keeps."""
+
 
 def kinds_of(step: str) -> tuple[str, ...]:
     """Return the kinds of solves whose graphs a step of the pipeline leaves; others it makes on the way."""

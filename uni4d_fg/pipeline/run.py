@@ -47,7 +47,7 @@ from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.control import BegunControl, static_control
 from uni4d_fg.pipeline.fingerprint import sequence_digest, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
-from uni4d_fg.pipeline.graphs import GraphValues, kinds_of, remove_graphs
+from uni4d_fg.pipeline.graphs import KEPT, GraphValues, kinds_of, remove_graphs
 from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
@@ -207,7 +207,7 @@ def reconstruct(
     check_asked(sequence, config)
     if workers is not None and config.windows.frames is None:
         raise ConfigError("workers solve the windows of a long video: set windows.frames (`--window N`)")
-    recorder = RecordingRunner(stage_runner(config))
+    recorder = RecordingRunner(stage_runner(config), KEPT)
     # Threads of BLAS wait for each other in busy loops: on a busy machine small matrices take a thousand times as long.
     # What is worth several threads divides its work itself.
     with one_blas_thread(), run_lock(run_dir):

@@ -19,7 +19,7 @@ from uni4d_fg.factors.variable_types import INTRINSICS
 from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
-from uni4d_fg.geometry.camera import NEAR_PLANE, world_to_camera
+from uni4d_fg.geometry.camera import NEAR_PLANE, seen_from
 from uni4d_fg.optim.added_factors import adding_to
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
@@ -288,7 +288,7 @@ def _departure_from_cue(result: DynamicScene, observations: Observations, camera
     if len(used) == 0:
         return 0.0
     points = result.points[np.searchsorted(result.track, used.track), used.frame]
-    z = world_to_camera(cameras.world_T_cam[used.frame], points)[:, 2]
+    z = seen_from(cameras.world_T_cam, used.frame, points)[:, 2]
     ratio = np.log(np.maximum(z, NEAR_PLANE)) - np.log(used.depth) - cameras.log_scale[used.frame]
     return float(np.median(np.abs(ratio)))
 
@@ -305,7 +305,7 @@ def correct_cue(
     if not energy_of(config).is_likelihood or len(observations) == 0 or len(scene["landmarks"]) == 0:
         return observations, cameras, noise, []
     static, row = landmark_observations(labelled, scene)
-    z = world_to_camera(cameras.world_T_cam[static.frame], scene["landmarks"][row])[:, 2]
+    z = seen_from(cameras.world_T_cam, static.frame, scene["landmarks"][row])[:, 2]
     measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
     neighbors, samples = config.nonrigid.local_scale_neighbors, config.nonrigid.local_scale_samples
     local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbors, samples)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, rows_by_group
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -45,9 +45,8 @@ class Residuals:
         """Return a quantile of the lengths of each frame, (T,) px; NaN where a frame has none."""
         chosen = self.is_dynamic == dynamic
         frame, norm = self.frame[chosen], self.norm[chosen]
-        order = np.argsort(frame, kind="stable")
-        parts = np.split(norm[order], np.searchsorted(frame[order], np.arange(1, num_frames)))
-        return np.array([np.quantile(part, quantile) if len(part) else np.nan for part in parts])
+        parts = rows_by_group(frame, num_frames)
+        return np.array([np.quantile(norm[rows], quantile) if len(rows) else np.nan for rows in parts])
 
 
 def reprojection_residuals(reconstruction: Reconstruction, labelled: LabelledTracks) -> Residuals:

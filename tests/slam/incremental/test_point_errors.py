@@ -11,10 +11,10 @@ from uni4d_fg.optim.stage import run_stage
 from uni4d_fg.slam.incremental.labels import LabelledFrame
 from uni4d_fg.slam.incremental.point_errors import PointErrors, point_errors
 from uni4d_fg.slam.incremental.pose import locate
-from uni4d_fg.slam.stages.bundle_adjustment import reprojection_term
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
+from uni4d_fg.slam.stages.structure import reprojection_term
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
 NOISE = StaticNoise(0.5, 0.03)

@@ -10,7 +10,13 @@ from uni4d_fg.pipeline.compare.comparison import Comparison
 from uni4d_fg.pipeline.compare.solvers import LM
 from uni4d_fg.pipeline.compare.trace import EQUAL
 
-STAGE_OF_KIND = {"camera_init": "1", "bundle_adjustment": "2", "structure": "2", "nonrigid": "3"}
+STAGE_OF_KIND = {
+    "camera_init": "1",
+    "bundle_adjustment": "2",
+    "structure": "2",
+    "further_landmarks": "2",
+    "nonrigid": "3",
+}
 ALL_STAGES = "1-3"
 
 

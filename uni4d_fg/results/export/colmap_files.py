@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, IntArray, rows_by_group
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.slam.reconstruction import zoomed
 
@@ -63,8 +63,7 @@ class ColmapModel:
 
     def of_image(self) -> list[IntArray]:
         """Return the observations (rows) of each image in turn."""
-        order = np.argsort(self.image, kind="stable")
-        return np.split(order, np.searchsorted(self.image[order], np.arange(1, len(self.names))))
+        return rows_by_group(self.image, len(self.names))
 
     def of_point(self) -> IntArray:
         """Return where the observations of each point begin and end, (P + 1,)."""

@@ -18,13 +18,13 @@ from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.slam.incremental.labels import LabelledFrame
 from uni4d_fg.slam.incremental.point_errors import PointErrors
-from uni4d_fg.slam.stages.bundle_adjustment import depth_prior_terms, reprojection_term
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.lifting import frame_log_scales
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
 from uni4d_fg.slam.stages.static_covariance import track_cells
 from uni4d_fg.slam.stages.static_outliers import reprojection_residual
+from uni4d_fg.slam.stages.structure import depth_prior_terms, reprojection_term
 
 
 @dataclass(frozen=True)

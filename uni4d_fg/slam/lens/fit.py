@@ -28,7 +28,6 @@ from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
-    structure_problem,
     without_camera_motion,
 )
 from uni4d_fg.slam.stages.energy import MAP
@@ -36,6 +35,7 @@ from uni4d_fg.slam.stages.lifting import lift, mean_per_row
 from uni4d_fg.slam.stages.observations import observations_of
 from uni4d_fg.slam.stages.scene import Cameras, StaticScene
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
+from uni4d_fg.slam.stages.structure import structure_problem
 
 _FAR = 50.0
 """Whitened error, squared and summed in a logarithm, beyond which a held-out observation counts as lost."""

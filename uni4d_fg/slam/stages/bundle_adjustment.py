@@ -14,33 +14,37 @@ from dataclasses import dataclass
 import numpy as np
 
 from uni4d_fg.allocation import return_free_memory
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.stages import AccelerationConfig, BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch
-from uni4d_fg.factors.depth_prior import static_depth_prior
-from uni4d_fg.factors.priors import log_scale_prior, scale_anchor
+from uni4d_fg.factors.priors import scale_anchor
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.optim.added_factors import HOLDS_SCALE, joined_by
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
-from uni4d_fg.optim.stage import Stage, StageRunner, early, run_stage
+from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.acceleration import AccelerationPrior, estimate_prior, starting_prior
-from uni4d_fg.slam.stages.energy import MAP, Energy, kernel_of
+from uni4d_fg.slam.stages.energy import MAP, Energy
 from uni4d_fg.slam.stages.frame_noise import weigh_by_frame
-from uni4d_fg.slam.stages.lifting import lift, mean_per_row
 from uni4d_fg.slam.stages.merging import FindFragments, MergedTracks, merge_tracks
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
 from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import drop_outliers, landmark_errors, measure_noise, spatial_inliers
+from uni4d_fg.slam.stages.structure import (
+    LARGE,
+    depth_prior_terms,
+    further_landmarks,
+    joined_landmarks,
+    liftable,
+    refine_structure,
+    relift_structure,
+    reprojection_term,
+)
 from uni4d_fg.slam.stages.terms import camera_motion_terms, intrinsics_priors
-
-_MUCH = 256 << 20
-"""Bytes; more free memory than this is handed back before a solve, of which a long video needs as much again."""
 
 
 @dataclass(frozen=True)
@@ -110,58 +114,6 @@ def bundle_adjustment_problem(
     return problem
 
 
-def structure_problem(
-    state: State, observations: Observations, noise: StaticNoise, config: BundleAdjustmentConfig
-) -> Problem:
-    """Put the refinement of landmarks and frame scales with frozen cameras together.
-
-    Bundle adjustment widens the depth prior (``depth_sigma_factor``) because the errors of a depth cue are
-    correlated and would bias the cameras. With the cameras known, the structure is best where triangulation
-    and all depth cues of a track agree, each at its own noise.
-    """
-    num_frames = len(state[POSE])
-    _, row = observations.rows()
-    problem = Problem.over(state).eliminate(LANDMARK).fix(POSE).fix(INTRINSICS)
-    problem.add(reprojection_term(observations, row, noise.reprojection_sigma_px, num_frames, config, MAP))
-    sigma = min(noise.depth_sigma, config.depth_sigma)
-    return problem.add(depth_prior_terms(observations, row, sigma, num_frames, config))
-
-
-def reprojection_term(
-    observations: Observations,
-    row: IntArray,
-    sigma: float,
-    num_frames: int,
-    config: BundleAdjustmentConfig,
-    energy: Energy,
-) -> FactorBatch:
-    """Return E_BA; ``row`` (N,) is the landmark row of each observation."""
-    noise = energy.observed(sigma, observations.weight, config.reprojection_kernel, observations.frame, num_frames)
-    return static_reprojection(observations.frame, row, 0, uv=observations.uv, **noise)
-
-
-def depth_prior_terms(
-    observations: Observations,
-    row: IntArray,
-    sigma: float,
-    num_frames: int,
-    config: BundleAdjustmentConfig,
-    log_scale: float = 0.0,
-) -> list[FactorBatch]:
-    """Return the depth prior of every observation with a cue, and the prior on the frames' log-scales about one."""
-    known = np.isfinite(observations.depth)
-    frame = observations.frame[known]
-    return [
-        static_depth_prior(
-            frame, row[known], frame, depth=observations.depth[known], sigma=sigma, weight=observations.weight[known],
-            kernel=kernel_of(config.depth_kernel),
-        ),
-        log_scale_prior(
-            np.arange(num_frames), measured=np.full((num_frames, 1), log_scale), sigma=config.depth_scale_prior_sigma
-        ),
-    ]  # fmt: skip
-
-
 def scale_anchors(world_T_cam: FloatArray, sigma_m: float) -> list[FactorBatch]:
     """Hold the distance between frame 0 and the camera farthest from it; empty for a camera at rest."""
     distance = np.linalg.norm(world_T_cam[:, :3, 3] - world_T_cam[0, :3, 3], axis=1)
@@ -202,12 +154,15 @@ def adjust_bundle(
         SolverError: If the system is singular or a cue is not finite.
     """
     dropped: dict[str, int] = {}
-    observations, landmarks = _liftable(observations, start, config, dropped)
+    observations, landmarks = liftable(observations, start, config, dropped)
     if len(observations) == 0:
         raise DegenerateProblemError(
             "bundle adjustment: no static track has depth in any frame and is seen in "
             f"{config.min_observations} frames. Check masks and depth with 'uni4d-fg validate'."
         )
+    others: Observations | None = None
+    if energy.is_likelihood and config.structure == "refine" and len(observations) > config.max_camera_observations:
+        observations, landmarks, others = _for_cameras(observations, landmarks, config)
     state = start.state(landmarks, observations.rows()[0])
     noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma, config.depth_correlation)
     solves: list[SolveSummary] = []
@@ -223,7 +178,7 @@ def adjust_bundle(
 
     for index in range(rounds):
         problem = declare()
-        return_free_memory(_MUCH)
+        return_free_memory(LARGE)
         if index == 1 and freedom.poses and motion.is_weak:
             motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
             problem = declare()
@@ -255,6 +210,10 @@ def adjust_bundle(
         solves += refined
         if cue_holds_scale:
             state = hold_metric_scale(state)
+    if others is not None and solves[-1].termination is not Termination.CANCELLED:
+        held, others, refined = further_landmarks(state, others, noise, config, dropped, hooks, run)
+        solves += refined
+        state, observations = joined_landmarks([state, held]), Observations.joined([observations, others])
     if config.structure == "relift":
         state = relift_structure(state, observations)
     keep = spatial_inliers(state[LANDMARK], config)
@@ -272,38 +231,6 @@ def adjust_bundle(
         *covariances, solves, dropped, acceleration=motion if energy.is_likelihood else None,
     )  # fmt: skip
     return scene if merged is None else merged.split(scene)
-
-
-def refine_structure(
-    state: State,
-    observations: Observations,
-    noise: StaticNoise,
-    config: BundleAdjustmentConfig,
-    hooks: Hooks | None = None,
-    run: StageRunner = run_stage,
-    kind: str = "structure",
-) -> tuple[State, StaticNoise, list[SolveSummary]]:
-    """Solve landmarks and frame scales under frozen cameras; return the state, the noise and the solves.
-
-    Twice: the second solve uses the depth noise that the first one reveals, and starts where that ended.
-    """
-    solves = []
-    for solver in (early(config.structure_solver), config.structure_solver):
-        problem = structure_problem(state, observations, noise, config)
-        return_free_memory(_MUCH)
-        state, summary = run(Stage(kind, problem, solver), state, hooks)
-        del problem
-        solves.append(summary)
-        noise = measure_noise(state, observations, noise, config)
-    return state, noise, solves
-
-
-def relift_structure(state: State, observations: Observations) -> State:
-    """Put every landmark at the mean lift of its depth cues, where it has any."""
-    landmarks = state[LANDMARK]
-    _, row = observations.rows()
-    lifted = mean_per_row(lift(observations, Cameras.of(state)), observations.weight, row, len(landmarks))
-    return state.replace({LANDMARK: np.where(np.isfinite(lifted), lifted, landmarks)})
 
 
 def hold_metric_scale(state: State) -> State:
@@ -337,15 +264,10 @@ def _covariances(
     return marginals.blocks(POSE, len(state[POSE])), marginals.blocks(INTRINSICS, 1)[0]
 
 
-def _liftable(
-    observations: Observations, cameras: Cameras, config: BundleAdjustmentConfig, dropped: dict[str, int]
-) -> tuple[Observations, FloatArray]:
-    """Keep tracks that are long enough and have depth; return them with their starting landmarks."""
-    before = len(np.unique(observations.track))
-    observations = observations.with_min_observations(min(config.min_observations, len(cameras.world_T_cam)))
-    tracks, row = observations.rows()
-    dropped["track with too few observations"] = before - len(tracks)
-    landmarks = mean_per_row(lift(observations, cameras), observations.weight, row, len(tracks))
-    known = np.asarray(np.isfinite(landmarks).all(axis=1))
-    dropped["track without depth"] = int((~known).sum())
-    return observations.select(known[row]), landmarks[known]
+def _for_cameras(
+    observations: Observations, landmarks: FloatArray, config: BundleAdjustmentConfig
+) -> tuple[Observations, FloatArray, Observations]:
+    """Return the observations that find the cameras, their landmarks, and the other observations."""
+    _, row = observations.rows()
+    chosen = observations.thinned(config.max_camera_observations)
+    return observations.select(chosen), landmarks[np.unique(row[chosen])], observations.select(~chosen)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, rows_by_group
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.factors.state import State
 from uni4d_fg.slam.stages.noise import robust_sigma
@@ -28,8 +28,7 @@ def relative_noise(residual: FloatArray, frame: np.ndarray, num_frames: int, flo
         num_frames: T.
         floor_px: Noise below this is taken for as much.
     """
-    order = np.argsort(frame, kind="stable")
-    parts = np.split(residual[order], np.searchsorted(frame[order], np.arange(1, num_frames)))
+    parts = [residual[rows] for rows in rows_by_group(frame, num_frames)]
     sigma = np.array([robust_sigma(part) if len(part) >= _ENOUGH else np.nan for part in parts])
     ratio = np.ones(num_frames)
     for t in np.flatnonzero(np.isfinite(sigma)).tolist():

@@ -27,13 +27,14 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
-from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, refine_structure
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import Energy, energy_of, kernel_of
 from uni4d_fg.slam.stages.neighbors import nearest_neighbors
 from uni4d_fg.slam.stages.nonrigid import PointMesh, motion_terms
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, DynamicScene, StaticNoise, StaticScene
 from uni4d_fg.slam.stages.static_outliers import drop_outliers, landmark_errors
+from uni4d_fg.slam.stages.structure import refine_structure
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, sum_rows
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, rows_by_group, sum_rows
 from uni4d_fg.geometry.camera import lifted_from, seen_from, unproject
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras
@@ -44,8 +44,8 @@ def frame_log_scales(
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.log(np.maximum(z, 1e-6)) - np.log(observations.depth)
     out = np.zeros(num_frames)
-    for t in range(num_frames):
-        of_frame = ratio[(observations.frame == t) & np.isfinite(ratio)]
-        if len(of_frame):
-            out[t] = np.median(of_frame)
+    known = np.flatnonzero(np.isfinite(ratio))
+    for t, rows in enumerate(rows_by_group(observations.frame[known], num_frames)):
+        if len(rows):
+            out[t] = np.median(ratio[known[rows]])
     return out

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
+from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread, rows_by_group
 from uni4d_fg.geometry.nearest_points import NearestPoints
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.slam.stages.noise import robust_sigma
@@ -62,12 +62,13 @@ def predict_log_scale(
     whole_frame = LocalScale(frame_log_scale[queries.frame], frame_sigma, frame_sigma)
     if neighbors == 0:
         return whole_frame
+    count = len(frame_log_scale)
     usable = np.flatnonzero(np.isfinite(deviation))
+    usable_of, queries_of = rows_by_group(static.frame[usable], count), rows_by_group(queries.frame, count)
 
     def of_frame(frame: int) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return the queries of a frame, what is predicted for them, and errors of predictions on the static scene."""
-        known = usable[static.frame[usable] == frame]
-        mine = np.flatnonzero(queries.frame == frame)
+        known, mine = usable[usable_of[frame]], queries_of[frame]
         if len(known) <= neighbors:
             return mine[:0], np.zeros(0), np.zeros(0)
         tree, values = NearestPoints(static.uv[known]), deviation[known]
@@ -94,7 +95,7 @@ def predict_log_scale(
         return mine, predicted, np.concatenate(errors)
 
     predicted, errors = np.zeros(len(queries)), [np.zeros(0)]
-    for mine, found, missed in map_in_order(of_frame, list(range(len(frame_log_scale))), thread_count()):
+    for mine, found, missed in map_in_order(of_frame, list(range(count)), thread_count()):
         predicted[mine] = found
         errors.append(missed)
     sigma = robust_sigma(np.concatenate(errors))

@@ -42,10 +42,15 @@ class MergedTracks:
     def split(self, scene: StaticScene) -> StaticScene:
         """Return the scene with the tracks' own names: one landmark per track, at its point."""
         seen = scene.observations
+        shared = np.unique(self.point[self.point != self.track])
+        ours, theirs = np.isin(self.point, shared), np.isin(seen.track, shared)
         frames = 1 + int(self.frame.max(initial=0))
-        key = self.point * frames + self.frame
+        key = self.point[ours] * frames + self.frame[ours]
         order = np.argsort(key, kind="stable")
-        own = self.track[order][np.searchsorted(key[order], seen.track * frames + seen.frame)]
+        own = seen.track.copy()
+        own[theirs] = self.track[ours][order][
+            np.searchsorted(key[order], seen.track[theirs] * frames + seen.frame[theirs])
+        ]
         tracks, first = np.unique(own, return_index=True)
         landmark = np.searchsorted(scene.landmark_track, seen.track[first])
         seen = replace(seen, track=own)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray, evenly_spread
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 
 
@@ -28,8 +29,8 @@ class Observations:
     def __len__(self) -> int:
         return len(self.track)
 
-    def select(self, keep: BoolArray | IntArray) -> Observations:
-        """Return the observations picked by a mask or by indices."""
+    def select(self, keep: BoolArray | IntArray | slice) -> Observations:
+        """Return the observations picked by a mask, by indices or by a slice."""
         return Observations(self.track[keep], self.frame[keep], self.uv[keep], self.depth[keep], self.weight[keep])
 
     def with_min_observations(self, count: int) -> Observations:
@@ -37,6 +38,19 @@ class Observations:
         if len(self) == 0:
             return self
         return self.select(np.bincount(self.track)[self.track] >= count)
+
+    def thinned(self, count: int) -> BoolArray:
+        """Tell which observations (N,) are of evenly spread tracks that have about ``count`` of them together."""
+        tracks, row = self.rows()
+        chosen = np.zeros(len(tracks), dtype=bool)
+        chosen[evenly_spread(len(tracks), max(1, len(tracks) * count // max(len(self), 1)))] = True
+        return np.asarray(chosen[row])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Observations]) -> Observations:
+        """Return the observations of several parts that share no track."""
+        arrays = {field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)}
+        return cls(**arrays).select(np.argsort(arrays["track"], kind="stable"))
 
     def rows(self) -> tuple[IntArray, IntArray]:
         """Return the distinct tracks (M,), ascending, and the row of each observation among them (N,)."""

@@ -22,7 +22,7 @@ from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.stages import NonRigidConfig
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, log_depth
-from uni4d_fg.geometry.camera import world_to_camera
+from uni4d_fg.geometry.camera import seen_from
 from uni4d_fg.slam.stages.energy import Energy
 from uni4d_fg.slam.stages.lifting import frame_log_scales
 from uni4d_fg.slam.stages.noise import robust_sigma
@@ -81,7 +81,7 @@ def lift_noise(static: Observations, landmarks: FloatArray, cameras: Cameras) ->
     Returns:
         None without any depth.
     """
-    z = world_to_camera(cameras.world_T_cam[static.frame], landmarks)[:, 2]
+    z = seen_from(cameras.world_T_cam, static.frame, landmarks)[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         measured = log_depth(z) - np.log(static.depth)
     known = np.isfinite(measured)

@@ -14,6 +14,9 @@ from uni4d_fg.slam.stages.noise import intraclass_correlation, robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
+_AT_ONCE = 1 << 20
+"""Observations of which what is computed on the way is held at a time."""
+
 
 def reprojection_residual(state: State, observations: Observations, row: IntArray) -> FloatArray:
     """Return the raw reprojection residual of every observation, (N, 2) px; ``row`` is its landmark's row."""
@@ -34,10 +37,13 @@ def _off_by(state: State, observations: Observations, x: FloatArray) -> FloatArr
 def landmark_errors(state: State, observations: Observations) -> Float32Array:
     """Return each landmark's median reprojection error, (N,) px."""
     tracks, row = observations.rows()
-    residual = reprojection_residual(state, observations, row)
-    norm = np.linalg.norm(residual, axis=1)
+    norm = np.empty(len(row), np.float32)
+    for first in range(0, len(row), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        residual = reprojection_residual(state, observations.select(some), row[some])
+        norm[some] = np.linalg.norm(residual, axis=1)
     # Bits of positive floats are in the order of the floats: one sort by row, then by norm.
-    bits = norm.astype(np.float32).view(np.uint32)
+    bits = norm.view(np.uint32)
     order = np.sort(row.astype(np.uint64) << np.uint64(32) | bits)
     start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(tracks)))])
     middle = (start[:-1] + start[1:] - 1) // 2

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, evenly_spread
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
@@ -96,10 +96,8 @@ class StaticSceneSolver:
         observations = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
         if self.observations_per_frame is not None:
             wanted = self.observations_per_frame * labelled.tracks.num_frames
-            tracks, _ = observations.rows()
             if len(observations) > wanted:
-                chosen = tracks[evenly_spread(len(tracks), max(1, len(tracks) * wanted // len(observations)))]
-                observations = observations.select(np.isin(observations.track, chosen))
+                observations = observations.select(observations.thinned(wanted))
         if energy_of(self.config).is_likelihood:
             drift = self.config.bundle_adjustment.drift_frames
             observations = weigh_by_drift(observations, labelled.tracks.query_frame, drift)

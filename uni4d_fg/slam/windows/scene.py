@@ -30,8 +30,6 @@ from uni4d_fg.slam.stages.acceleration import AccelerationPrior
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
-    refine_structure,
-    relift_structure,
     without_camera_motion,
 )
 from uni4d_fg.slam.stages.observations import Observations
@@ -39,6 +37,7 @@ from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
 from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import landmark_errors, spatial_inliers
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
+from uni4d_fg.slam.stages.structure import refine_structure, relift_structure
 from uni4d_fg.slam.windows.information import FRAME, SHARED, Uncertainty, WindowInformation
 from uni4d_fg.slam.windows.numbered import NumberedRunner
 from uni4d_fg.slam.windows.plan import (
