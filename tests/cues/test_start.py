@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, tracked
@@ -9,7 +11,7 @@ from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, t
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
 from uni4d_fg.cues.structure.first_pair import FramePair
-from uni4d_fg.cues.structure.focal_interval import design_effect, focal_interval
+from uni4d_fg.cues.structure.focal_interval import clustered_deviation, design_effect, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow, misfits
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, Part, distinct, trial_frames
@@ -182,3 +184,28 @@ def test_pairs_that_compete_lie_apart() -> None:
     pairs = [FramePair(a, b, 30.0, 100) for a, b in ((0, 10), (1, 11), (0, 9), (20, 30), (22, 30))]
     assert [(p.first, p.second) for p in distinct(pairs, 2)] == [(0, 10), (20, 30)]
     assert len(distinct(pairs, 4)) == 4
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_tracks_of_one_part_of_the_image_that_drift_alike_widen_the_interval(seed: int) -> None:
+    scene = tracked(sideways(FRAMES), seed)
+    seen = scene.observations
+    tracks, row = seen.rows()
+    first = np.searchsorted(row, np.arange(len(tracks)))
+    column, line = (seen.uv[first] // 60).astype(int).clip(0, 15).T
+    drift = np.random.default_rng(seed).normal(0, 0.06, (16, 16, 2))[column, line]
+    uv = seen.uv + drift[row] * (seen.frame - seen.frame[first][row])[:, None]
+    growth, width = [], []
+    for observations in (seen, replace(seen, uv=uv)):
+        grown = scene_of(replace(scene, observations=observations))
+        grown.start(FramePair(4, 12, 30.0, 200))
+        grow(grown, SilentReporter())
+        grown.measure_noise()
+        stage, state, _, _ = grown.bundle()
+        growth.append(clustered_deviation(grown, stage, state) / grown.focal_deviation())
+        interval = focal_interval(grown, SIZE)
+        assert interval.low < K[0] < interval.high
+        width.append(interval.high / interval.low - 1.0)
+    assert 0.6 < growth[0] < 1.4  # independent errors: as the model says
+    assert growth[1] > 1.6
+    assert width[1] > 2 * width[0]

@@ -4,9 +4,12 @@ With everything else free to follow, the energy over the focal length f is E(f).
 
     E(f) - E(f*)  <=  3.84 / 2 * sigma^2 * d,
 
-with sigma^2 the variance of the residuals that are left, and d the design effect (Kish 1965) of errors that are not
-independent: those of one track, and those of one part of one frame. Where the quadratic at f* says that the interval
-is narrow, it is taken from there; elsewhere E(f) is minimized at several f. The prior on the focal length has no say.
+with sigma^2 the variance of the residuals that are left, and d what the variance of f grows by because errors are not
+independent. That is the larger of two: the design effect (Kish 1965) of residuals that are alike along a track and in
+one part of one frame; and what the pull at f of all tracks that begin in the same part of the image says
+(:mod:`uni4d_fg.optim.cluster_robust`). Neither sees what all parts share: d is taken to be `_SHARED` squared times as
+large. Where the quadratic at f* says that the interval is narrow, it is taken from there;
+elsewhere E(f) is minimized at several f. The prior on the focal length has no say.
 """
 
 from __future__ import annotations
@@ -21,8 +24,9 @@ from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.selection import picture_cells
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable_types import INTRINSICS
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK
 from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.optim.cluster_robust import Clusters, clustered_marginals, image_cells
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import Termination
@@ -30,6 +34,10 @@ from uni4d_fg.slam.stages.noise import intraclass_correlation
 
 _CHI2 = 3.841
 """95 % of chi squared with one degree of freedom."""
+_SHARED = 2.0
+"""On 34 random synthetic clips half of the errors of f were above 1.8 standard deviations, and not above 0.7."""
+_CELLS = 8
+"""Parts of the image along its longer side whose tracks may err alike."""
 _NARROW = 0.015
 """Up to this relative standard deviation, E(f) is as good as quadratic."""
 _FIRST_STEP = 0.03
@@ -77,8 +85,12 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
     stage, state, frames, rows = scene.bundle()
     if not stage.problem.is_free(INTRINSICS):
         return FocalInterval(focal, focal)
+    independent = scene.focal_deviation()
     noise = _noise(scene, stage, state, frames, rows, image_size)
-    deviation = scene.focal_deviation() * np.sqrt(noise)
+    if np.isfinite(independent):
+        noise = max(noise, (clustered_deviation(scene, stage, state) / independent) ** 2)
+    noise *= _SHARED**2
+    deviation = independent * np.sqrt(noise)
     if deviation <= _NARROW:
         return FocalInterval(focal * np.exp(-1.96 * deviation), focal * np.exp(1.96 * deviation))
     profile = _Profile(scene, noise)
@@ -139,6 +151,17 @@ def _noise(
     cells = picture_cells(observations.uv, image_size)
     _, place = np.unique(observations.frame * (cells.max() + 1) + cells, return_inverse=True)
     return 2.0 * energy / free * design_effect(residual, track) * design_effect(residual, place)
+
+
+def clustered_deviation(scene: GrowingScene, stage: Stage, state: State) -> float:
+    """Return the standard deviation of log f where the tracks of one part of the image err alike; 0 if unknown."""
+    used, row = scene.used()
+    _, first = np.unique(row, return_index=True)  # of each track, its first frame
+    clusters = Clusters(image_cells(used.uv[first], scene.intrinsics, _CELLS), _CELLS**2)
+    marginals = clustered_marginals(stage.problem, state, stage.solver, clusters, LANDMARK)
+    if marginals is None:
+        return 0.0
+    return float(np.sqrt(np.max(np.diag(marginals.blocks(INTRINSICS, 1)[0])[:2] / scene.intrinsics[:2] ** 2)))
 
 
 def design_effect(residual: FloatArray, group: IntArray) -> float:
