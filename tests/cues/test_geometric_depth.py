@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from uni4d_fg.cues.interpolated_depth import (
 from uni4d_fg.cues.triangle_grid import linear_on_grid
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import Video
+from uni4d_fg.frontend.synthetic import make_synthetic_sequence
 from uni4d_fg.frontend.synthetic.simulate import Simulation, simulate
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import world_to_camera
@@ -183,14 +185,20 @@ def test_cancelling_ends_it(scene: Simulation, static: BoolArray, calls: int) ->
         run(scene, static, should_stop=stop_after(calls))
 
 
-def test_settings_loosen_moving_depth_and_keep_the_focal_length_without_parallax() -> None:
+def test_settings_loosen_moving_depth_and_keep_a_focal_length_that_motion_does_not_tell() -> None:
     config = load_config("default", [])
-    assert settings_for_depth(config, None) == config
-    assert settings_for_depth(config, True).nonrigid.depth_sigma == config.geometric_depth.moving_depth_sigma
-    assert settings_for_depth(config, True).input.intrinsics == "free"
-    assert settings_for_depth(config, False).input.intrinsics == "fixed"
+    given = make_synthetic_sequence(SyntheticSceneConfig(num_frames=2, width=64, height=48, render_images=False))
+    seen, unseen = (replace(given, depth_parallax=parallax) for parallax in (True, False))
+    assert settings_for_depth(config, given) == config
+    assert settings_for_depth(config, seen).nonrigid.depth_sigma == config.geometric_depth.moving_depth_sigma
+    assert settings_for_depth(config, seen).input.intrinsics == "free"
+    assert settings_for_depth(config, unseen).input.intrinsics == "fixed"
+    assert settings_for_depth(config, replace(seen, focal_is_open=True)).input.intrinsics == "fixed"
+    aligned = settings_for_depth(config, replace(given, focal_is_open=True))  # a network's depth, scaled by motion
+    assert aligned.input.intrinsics == "fixed"
+    assert aligned.nonrigid.depth_sigma is None
     own = load_config("default", ["nonrigid.depth_sigma=0.02"])
-    assert settings_for_depth(own, True).nonrigid.depth_sigma == 0.02
+    assert settings_for_depth(own, seen).nonrigid.depth_sigma == 0.02
 
 
 def plane(uv: np.ndarray) -> np.ndarray:

@@ -9,9 +9,10 @@ import pytest
 from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, tracked
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
 from uni4d_fg.cues.structure.first_pair import FramePair
-from uni4d_fg.cues.structure.focal_interval import clustered_deviation, design_effect, focal_interval
+from uni4d_fg.cues.structure.focal_interval import FocalInterval, clustered_deviation, design_effect, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow, misfits
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, Part, distinct, trial_frames
@@ -26,9 +27,9 @@ CONFIG = load_config("default", [])
 FRAMES = 20
 
 
-def found(scene: TrackedScene) -> Structure:
+def found(scene: TrackedScene, config: Config = CONFIG) -> Structure:
     structure = structure_from_motion(
-        scene.observations, len(scene.world_T_cam), SIZE, GUESS, CONFIG, SilentReporter(), lambda: False
+        scene.observations, len(scene.world_T_cam), SIZE, GUESS, config, SilentReporter(), lambda: False
     )
     assert structure is not None
     return structure
@@ -71,6 +72,32 @@ def test_forward_motion_leaves_the_focal_length_open_in_an_interval_that_holds_i
     below, above = structure.focal.relative(float(structure.intrinsics[0]))
     assert above - below > 0.04
     assert structure.focal.low <= K[0] <= structure.focal.high
+
+
+def test_what_motion_leaves_open_is_weighed_with_what_cameras_usually_have() -> None:
+    scene = tracked(forward(FRAMES), 0, noise_px=0.5)
+    structure = found(scene)
+    assert structure.focal.is_wide
+    weight = 0.3**2 / (0.3**2 + structure.focal.deviation**2)
+    told = np.exp((np.log(structure.intrinsics[0]) - (1 - weight) * np.log(GUESS[0])) / weight)
+    tight = CONFIG.geometric_depth.model_copy(update={"focal_log_sigma": 1e-3})
+    usual = found(scene, CONFIG.model_copy(update={"geometric_depth": tight}))
+    free = CONFIG.geometric_depth.model_copy(update={"focal_log_sigma": 1e3})
+    alone = found(scene, CONFIG.model_copy(update={"geometric_depth": free}))
+    assert usual.intrinsics[0] == pytest.approx(GUESS[0], rel=1e-4)
+    assert alone.intrinsics[0] == pytest.approx(told, rel=1e-4)
+    assert usual.sigma_px < 1.2 * alone.sigma_px  # points and cameras have followed
+    for structure in (usual, alone):
+        assert structure.focal.low <= structure.intrinsics[0] <= structure.focal.high
+        assert error_of(structure, scene)[0] < 0.02
+
+
+def test_a_focal_length_of_which_tracks_say_nothing_is_the_usual_one() -> None:
+    interval = FocalInterval(100.0, 900.0, True, True, float("nan"))
+    assert interval.is_wide
+    assert interval.likely(700.0, 500.0, 0.3) == 500.0
+    half = FocalInterval(100.0, 900.0, deviation=0.3)
+    assert half.likely(800.0, 200.0, 0.3) == pytest.approx(400.0)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -122,7 +122,7 @@ def reconstruct(
     def solve(video: Video, folder: Path, again: bool, warnings: tuple[str, ...] = ()) -> tuple[RunSummary, Sequence]:
         forecast = Forecast(expected_shares(video.num_frames, video.image_size, settings, plan, video.tracks))
         sequence, report = run_cues(video, plan, folder, settings, quiet=quiet, forecast=forecast)
-        chosen = settings_for_depth(settings, sequence.depth_parallax)
+        chosen = settings_for_depth(settings, sequence)
         summary = run_pipeline(
             sequence, folder, chosen, resume=again, quiet=quiet, cues=report, measurements=files, imu=samples,
             warnings=warnings, forecast=forecast, workers=work,

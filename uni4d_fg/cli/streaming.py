@@ -71,7 +71,7 @@ def stream(
             "first with 'uni4d-fg cues'"
         )
     sequence = source.read()
-    settings = settings_for_depth(settings, sequence.depth_parallax)
+    settings = settings_for_depth(settings, sequence)
     if online_tracks:
         sequence = replace(sequence, tracks=None)
     files = MeasurementFiles(odometry, gps, relative_poses)

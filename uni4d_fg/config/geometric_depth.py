@@ -76,6 +76,10 @@ class GeometricDepthConfig(Section):
         (0.4, 3.0), "Starts that end with a focal length outside this range, as parts of the longer image side, are "
         "taken only where no other explains the tracks.",
     )  # fmt: skip
+    focal_log_sigma: float = setting(
+        0.3, "Where the tracks leave the focal length open it is weighed with the given one, or the longer image side: "
+        "standard deviation of its log about that.", gt=0,
+    )  # fmt: skip
     retries: int = setting(1, "How often frames that fit badly are taken out and posed again.", ge=0)
     trim_sigmas: float = setting(
         2.5, "Cameras are refined from the tracks of which most observations agree within this many times the noise "

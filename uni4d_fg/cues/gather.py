@@ -91,9 +91,11 @@ class _Gathering:
             self.report.metric = False
             self.report.warnings.append(NOT_METRIC_GIVEN)
         self.depth_parallax = video.depth_parallax if plan.depth == "given" else None
+        self.focal_is_open = plan.depth == "given" and video.focal_is_open
         self.tracks = video.tracks if plan.tracks == "given" else None
         self.track_file: Path | None = None
         self.intrinsics = video.intrinsics
+        self.intrinsics_of_motion: FloatArray | None = None
         self.world_T_cam = video.initial_world_T_cam
         self.cameras_of_motion: FloatArray | None = None
         self.moving_tracks: BoolArray | None = None
@@ -124,15 +126,15 @@ class _Gathering:
                     self.motion_warnings += doubts_of_masks(before, self.cameras_of_motion)
         if plan.keep_built_in_tracks:
             self._any_tracks()
-        if self.intrinsics is None:
+        if self.intrinsics is None and self.intrinsics_of_motion is None:
             report.sources["intrinsics"] = "guessed from the image size"
         report.facts += self.motion_facts
         report.warnings[:0] = self.motion_warnings
         sequence = as_sequence(
             replace(
-                self.video, depths=depths, masks=masks, intrinsics=self._start_intrinsics(), tracks=self.tracks,
+                self.video, depths=depths, masks=masks, intrinsics=self._best_intrinsics(), tracks=self.tracks,
                 initial_world_T_cam=self.world_T_cam, content=None, depth_is_metric=report.metric,
-                depth_parallax=self.depth_parallax,
+                depth_parallax=self.depth_parallax, focal_is_open=self.focal_is_open,
             )
         )  # fmt: skip
         if not plan.is_given:
@@ -227,7 +229,7 @@ class _Gathering:
         self.motion_has_parallax = found.has_parallax
         self.cameras_of_motion = found.world_T_cam
         self.moving_tracks = found.moving
-        self.intrinsics = found.intrinsics
+        self.intrinsics_of_motion, self.focal_is_open = found.intrinsics, found.focal_is_open
         if video.intrinsics is None:
             report.sources["intrinsics"] = "from camera motion"
         self.motion_facts = [f"depth: {fact}" for fact in found.facts]
@@ -247,15 +249,22 @@ class _Gathering:
     def _motion_masks(self, depths: FrameSource[Float32Array]) -> FrameSource[Int32Array]:
         tracks = self._any_tracks()
         masks, facts, warnings = moving_masks(
-            self.video, depths, tracks, self._start_intrinsics(), self._key(), _name_of(depths), self.moving_tracks,
+            self.video, depths, tracks, self._best_intrinsics(), self._key(), _name_of(depths), self.moving_tracks,
             self.folder, self.config, self.reporter, self.should_stop,
         )  # fmt: skip
         self.report.facts += [f"masks: {fact}" for fact in facts]
         self.report.warnings += warnings
         return masks
 
+    def _best_intrinsics(self) -> FloatArray:
+        """Return what is known of the intrinsics so far, (4,) px, from camera motion too."""
+        return self._start_intrinsics() if self.intrinsics_of_motion is None else self.intrinsics_of_motion
+
     def _start_intrinsics(self) -> FloatArray:
-        """Return what is known of the intrinsics so far, (4,) px; a guess where that is nothing."""
+        """Return what is known of the intrinsics before camera motion, (4,) px; a guess where that is nothing.
+
+        Also in the second round: a focal length that the motion left open is no knowledge for the next.
+        """
         return guess_intrinsics(self.video.image_size) if self.intrinsics is None else self.intrinsics
 
     def _key(self) -> str:

@@ -89,7 +89,7 @@ def reconstruct(
                 video, plan, folder / "cues", settings, reporter=reporter, track_cache=folder / "stages"
             )
     cues = None if report is None else report.to_dict()
-    settings = settings_for_depth(settings, sequence.depth_parallax)
+    settings = settings_for_depth(settings, sequence)
     reconstruct_sequence(
         sequence, folder, settings, resume=resume, reporter=reporter, cues=cues, additions=additions,
         measurements=measurements, imu=samples, warnings=warnings, workers=workers,

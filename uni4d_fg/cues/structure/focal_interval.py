@@ -38,8 +38,8 @@ _SHARED = 2.0
 """On 34 random synthetic clips half of the errors of f were above 1.8 standard deviations, and not above 0.7."""
 _CELLS = 8
 """Parts of the image along its longer side whose tracks may err alike."""
-_NARROW = 0.015
-"""Up to this relative standard deviation, E(f) is as good as quadratic."""
+_NARROW = 0.03
+"""Up to this standard deviation of log f, E(f) is as good as quadratic."""
 _FIRST_STEP = 0.03
 """Step of log f with which the search for an end of the interval begins, at least ..."""
 _WIDEN = 1.6
@@ -59,6 +59,26 @@ class FocalInterval:
     """Whether the energy does not rise down to the least focal length that was tried."""
     high_is_open: bool = False
     """The same for the largest."""
+    deviation: float = 0.0
+    """Standard deviation of log f that the tracks leave, by the quadratic; NaN where they say nothing of f."""
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the tracks tell the focal length so poorly that what cameras usually have says something, too."""
+        return not self.deviation <= _NARROW
+
+    def likely(self, focal: float, usual: float, sigma: float) -> float:
+        """Return the most likely focal length, px, of a focal length that was found and one that cameras usually have.
+
+        Args:
+            focal: What the tracks say, px, with this interval's deviation.
+            usual: Of such a camera, px.
+            sigma: Standard deviation of the log of focal lengths about the usual one.
+        """
+        if not np.isfinite(self.deviation):
+            return usual
+        weight = sigma**2 / (sigma**2 + self.deviation**2)
+        return float(np.exp(weight * np.log(focal) + (1.0 - weight) * np.log(usual)))
 
     def relative(self, focal: float) -> tuple[float, float]:
         """Return by which part the ends are below (negative) and above a focal length."""
@@ -67,7 +87,7 @@ class FocalInterval:
     def holding(self, focals: list[float]) -> FocalInterval:
         """Return the interval widened so that it holds other focal lengths, px."""
         low, high = min([self.low, *focals]), max([self.high, *focals])
-        return FocalInterval(low, high, self.low_is_open, self.high_is_open)
+        return replace(self, low=low, high=high)
 
 
 def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInterval:
@@ -92,13 +112,14 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
     noise *= _SHARED**2
     deviation = independent * np.sqrt(noise)
     if deviation <= _NARROW:
-        return FocalInterval(focal * np.exp(-1.96 * deviation), focal * np.exp(1.96 * deviation))
+        ends = focal * np.exp(np.array([-1.96, 1.96]) * deviation)
+        return FocalInterval(float(ends[0]), float(ends[1]), deviation=deviation)
     profile = _Profile(scene, noise)
     limits = np.log(np.array(scene.config.geometric_depth.usual_focal) * max(image_size) / focal)
     step = max(_FIRST_STEP, float(np.nan_to_num(deviation, nan=0.1)))
     low, low_is_open = profile.end(-step, float(limits[0]))
     high, high_is_open = profile.end(step, float(limits[1]))
-    return FocalInterval(focal * np.exp(low), focal * np.exp(high), low_is_open, high_is_open)
+    return FocalInterval(focal * np.exp(low), focal * np.exp(high), low_is_open, high_is_open, deviation)
 
 
 class _Profile:

@@ -29,6 +29,9 @@ from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
+_FOCAL_STEP = 0.15
+"""Step of log f that cameras and points can follow."""
+
 
 @dataclass
 class GrowingScene:
@@ -173,9 +176,15 @@ class GrowingScene:
         stage, state, frames, rows = self.bundle()
         if relative_decrease is not None:
             stage = replace(stage, solver=stage.solver.model_copy(update={"relative_decrease": relative_decrease}))
+        self._take(self._solve(stage, state), frames, rows)
+
+    def _solve(self, stage: Stage, state: State) -> State:
         state, summary = run_stage(stage, state, Hooks(should_stop=self.should_stop))
         if summary.termination is Termination.CANCELLED:
             raise Cancelled("structure from motion stopped")
+        return state
+
+    def _take(self, state: State, frames: IntArray, rows: IntArray) -> None:
         self.world_T_cam[frames] = se3.orthonormalize(state[POSE])
         self.intrinsics = state[INTRINSICS][0].copy()
         self.position[rows] = state[LANDMARK]
@@ -192,6 +201,24 @@ class GrowingScene:
             return float("nan")
         variance = np.diag(marginals.blocks(INTRINSICS, 1)[0])[:2]
         return float(np.sqrt(np.max(variance / self.intrinsics[:2] ** 2)))
+
+    def hold_focal(self, focal: float) -> None:
+        """Take a focal length, px, and refine cameras and points for it, by steps in which they can follow.
+
+        What takes part is as before: on the way nothing agrees with its point.
+
+        Raises:
+            Cancelled: If asked to stop.
+            SolverError: If the system cannot be solved.
+        """
+        self.free_focal = False
+        ratio = focal / float(np.mean(self.intrinsics[:2]))
+        steps = max(1, int(np.ceil(abs(np.log(ratio)) / _FOCAL_STEP)))
+        stage, state, frames, rows = self.bundle()
+        for _ in range(steps):
+            intrinsics = state[INTRINSICS] * np.array([ratio ** (1 / steps)] * 2 + [1.0, 1.0])
+            state = self._solve(stage, state.replace({INTRINSICS: intrinsics}))
+        self._take(state, frames, rows)
 
     def used(self) -> tuple[Observations, IntArray]:
         """Return the observations that take part in bundle adjustment, and the track row of each."""

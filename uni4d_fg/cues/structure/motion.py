@@ -129,6 +129,13 @@ def structure_from_motion(
         if free_focal:
             usual = np.array(settings.usual_focal) * max(image_size)
             focal = focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
+        if free_focal and focal.is_wide:
+            likely = focal.likely(mean_focal, float(np.mean(intrinsics[:2])), settings.focal_log_sigma)
+            focal = focal.holding([likely])
+            scene.hold_focal(likely)
+            sigma = scene.measure_noise()
+            poses = _bridge(scene.world_T_cam, scene.registered)
+            track, points, moving = _triangulate_all(observations, poses, scene)
     reporter.end()
     return Structure(
         poses, scene.intrinsics, scene.registered, track, points, moving, sigma, best.pair, focal, best.unexplained,

@@ -126,6 +126,8 @@ class DepthNote(NamedTuple):
     """Whether depth is in meters."""
     parallax: bool | None = None
     """See :attr:`~uni4d_fg.frontend.sequence.model.Video.depth_parallax`."""
+    focal_is_open: bool = False
+    """See :attr:`~uni4d_fg.frontend.sequence.model.Video.focal_is_open`."""
 
 
 def load_depth_note(path: Path) -> DepthNote:
@@ -145,7 +147,15 @@ def load_depth_note(path: Path) -> DepthNote:
             path, "does not say whether the motion showed parallax",
             'write "from_motion": {"parallax": true} or {"parallax": false}, or leave it out',
         )  # fmt: skip
-    return DepthNote(note["metric"], None if motion is None else motion["parallax"])
+    if motion is None:
+        return DepthNote(note["metric"])
+    focal_is_open = motion.get("focal_is_open", False)
+    if not isinstance(focal_is_open, bool):
+        raise SequenceProblem(
+            path, "does not say whether the motion leaves the focal length open",
+            'write "focal_is_open": true or false, or leave it out',
+        )  # fmt: skip
+    return DepthNote(note["metric"], motion["parallax"], focal_is_open)
 
 
 def frame_names(images: ImageFolder | VideoFrames) -> tuple[str, ...]:
@@ -201,6 +211,7 @@ def as_sequence(video: Video) -> Sequence:
         initial_world_T_cam=video.initial_world_T_cam,
         depth_is_metric=video.depth_is_metric,
         depth_parallax=video.depth_parallax,
+        focal_is_open=video.focal_is_open,
         tracks=video.tracks,
         lens=video.lens,
         ground_truth=video.ground_truth,
@@ -254,6 +265,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
         depths=depths,
         depth_is_metric=note.metric,
         depth_parallax=note.parallax,
+        focal_is_open=note.focal_is_open,
         masks=masks,
         intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
         tracks=tracks,

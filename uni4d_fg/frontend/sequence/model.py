@@ -98,6 +98,8 @@ class Video:
     """Whether depth is in meters; else it is in a unit of its own."""
     depth_parallax: bool | None = None
     """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
+    focal_is_open: bool = False
+    """Whether the intrinsics were found from camera motion that leaves the focal length open."""
     masks: FrameSource[Int32Array] | None = None
     """T label maps (H, W), int32."""
     intrinsics: FloatArray | None = None
@@ -152,6 +154,8 @@ class Sequence:
     """Whether depth is in meters; else it is in a unit of its own."""
     depth_parallax: bool | None = None
     """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
+    focal_is_open: bool = False
+    """Whether the intrinsics were found from camera motion that leaves the focal length open."""
     tracks: Tracks | None = None
     """Long 2D point tracks, when the sequence brings them."""
     lens: Lens = PINHOLE

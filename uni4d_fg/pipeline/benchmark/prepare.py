@@ -115,13 +115,13 @@ def prepare(task: Task, reporter: Reporter | None = None, should_stop: Callable[
     source = "by true masks" if chosen.masks == "true" else _MASK_SOURCES[plan.masks]
     if plan.is_given:
         sequence = as_sequence(replace(used, masks=None) if made == "none" else used)
-        return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), None, source)
+        return Prepared(video, sequence, settings_for_depth(config, sequence), None, source)
     plan.check()
     sequence, report = gather_cues(
         used, plan, task.run_folder / "cues", config, reporter=reporter or SilentReporter(), should_stop=should_stop,
         track_cache=task.run_folder / "stages",
     )  # fmt: skip
-    return Prepared(video, sequence, settings_for_depth(config, sequence.depth_parallax), report.to_dict(), source)
+    return Prepared(video, sequence, settings_for_depth(config, sequence), report.to_dict(), source)
 
 
 def masks_of_run(
