@@ -6,19 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, tracked
+from cues.start_scenes import GUESS, SIZE, K, TrackedScene, camera_path, forward, sideways, tracked
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
-from uni4d_fg.cues.structure.first_pair import FramePair
+from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, clustered_deviation, design_effect, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow, misfits
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, Part, distinct, trial_frames
 from uni4d_fg.cues.structure.judging import held_out
-from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.cues.structure.motion import Structure, only_turns, structure_from_motion
 from uni4d_fg.cues.structure.rivals import rotation_difference
+from uni4d_fg.cues.structure.two_view import parallax
 from uni4d_fg.geometry import se3
 from uni4d_fg.progress import SilentReporter
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
@@ -236,3 +237,23 @@ def test_tracks_of_one_part_of_the_image_that_drift_alike_widen_the_interval(see
     assert 0.6 < growth[0] < 1.4  # independent errors: as the model says
     assert growth[1] > 1.6
     assert width[1] > 2 * width[0]
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.893, 1.0, 1.12, 1.3])
+def test_a_rotation_leaves_little_whatever_the_guess(factor: float) -> None:
+    """Turned by 30 degrees, the factors of 1.26 alone would leave pixels between two of them."""
+    poses = camera_path(2, (0.0, 0.0, 0.0), (0.0, -0.5, 0.0))
+    seen = tracked(poses, 0, noise_px=0.2).observations
+    a, b = CommonTracks(seen, 2).between(0, 1)
+    assert len(a) > 50
+    left = parallax(seen.uv[a], seen.uv[b], K * np.array([factor, factor, 1.0, 1.0]), known_focal=False)
+    assert left < 0.8
+
+
+def test_a_camera_that_only_turns_has_no_structure_at_the_focal_length_that_is_found() -> None:
+    scene = tracked(camera_path(FRAMES, (0.0, 0.0, 0.0), (0.05, -0.4, 0.03)), 1)
+    assert only_turns(scene_of(scene), scene.observations)
+    long = K * np.array([1.5, 1.5, 1.0, 1.0])
+    assert not only_turns(scene_of(scene, long), scene.observations)
+    moving = tracked(sideways(FRAMES), 1)
+    assert not only_turns(scene_of(moving), moving.observations)

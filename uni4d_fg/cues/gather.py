@@ -12,6 +12,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.models import Config
 from uni4d_fg.counted import counted
 from uni4d_fg.cues.cache import FloatMaps
+from uni4d_fg.cues.geometric_depth import GeometricDepth
 from uni4d_fg.cues.geometry_makers import aligned_depth, geometric_depth, moving_masks, video_key
 from uni4d_fg.cues.interpolated_depth import GridDepths
 from uni4d_fg.cues.intrinsics import shared_intrinsics
@@ -220,10 +221,17 @@ class _Gathering:
             settings = config.geometric_depth
             lower = settings.model_copy(update={"min_parallax_px": _LESS_PARALLAX * settings.min_parallax_px})
             config = config.model_copy(update={"geometric_depth": lower})
-        found = geometric_depth(
-            replace(video, masks=masks), tracks, static, self._start_intrinsics(), self._key(), self.folder,
-            config, self.reporter, self.should_stop,
-        )  # fmt: skip
+        masked = replace(video, masks=masks)
+
+        def from_motion(intrinsics: FloatArray) -> GeometricDepth:
+            return geometric_depth(
+                masked, tracks, static, intrinsics, self._key(), self.folder, config, self.reporter, self.should_stop
+            )
+
+        found = from_motion(self._start_intrinsics())
+        if not found.has_parallax and self.intrinsics_of_motion is not None:
+            # Rotations are best at the focal length that the first round found.
+            found = from_motion(self.intrinsics_of_motion)
         report.metric = False
         report.start = found.start
         self.motion_has_parallax = found.has_parallax

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
-from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
+from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import CONVERGED, grow
@@ -119,6 +119,9 @@ def structure_from_motion(
     scene.measure_noise()
     scene.adjust(CONVERGED)
     sigma = scene.measure_noise()
+    if with_doubts and only_turns(scene, scene.used()[0]):
+        reporter.end()
+        return None
     poses = _bridge(scene.world_T_cam, scene.registered)
     track, points, moving = _triangulate_all(observations, poses, scene)
     mean_focal = float(np.mean(scene.intrinsics[:2]))
@@ -141,6 +144,16 @@ def structure_from_motion(
         poses, scene.intrinsics, scene.registered, track, points, moving, sigma, best.pair, focal, best.unexplained,
         rivals,
     )  # fmt: skip
+
+
+def only_turns(scene: GrowingScene, used: Observations) -> bool:
+    """Tell whether, at the focal length that was found, a rotation explains what any two frames see.
+
+    At another focal length a camera that only turns seems to move.
+    """
+    settings = scene.config.geometric_depth
+    pairs = rank_pairs(used, len(scene.registered), scene.intrinsics, settings, known_focal=True)
+    return max((pair.parallax_px for pair in pairs), default=0.0) < settings.min_parallax_px
 
 
 def rotations_only(observations: Observations, num_frames: int, intrinsics: FloatArray) -> FloatArray:

@@ -23,6 +23,10 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, unproject
 
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 7)
+_FINER_FACTORS = np.array([0.91, 0.955, 1.045, 1.09])
+"""Around the best of those, where what a rotation leaves is little ..."""
+_DOUBTFUL_PX = 5.0
+"""... that is, up to this."""
 _REWEIGHTINGS = 4
 """Reweighted solves of the rotation fit."""
 _CONFIDENCE = 0.9999
@@ -70,10 +74,23 @@ def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray
         intrinsics: (4,) px; the focal lengths are varied from half to twice unless ``known_focal``.
         known_focal: Whether the focal lengths are exact.
     """
-    factors = np.ones(1) if known_focal else _FOCAL_FACTORS
+    if known_focal:
+        return float(_left_by_rotations(uv_first, uv_second, intrinsics, np.ones(1))[0])
+    left = _left_by_rotations(uv_first, uv_second, intrinsics, _FOCAL_FACTORS)
+    if left.min() > _DOUBTFUL_PX:
+        return float(left.min())
+    # A camera that turns far leaves pixels at a focal length between two factors.
+    finer = _FOCAL_FACTORS[left.argmin()] * _FINER_FACTORS
+    return float(min(left.min(), _left_by_rotations(uv_first, uv_second, intrinsics, finer).min()))
+
+
+def _left_by_rotations(
+    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, factors: FloatArray
+) -> FloatArray:
+    """Return the median distance (F,) px that a rotation leaves at each of F multiples of the focal lengths."""
     scale = np.ones((len(factors), 4))
     scale[:, :2] = factors[:, None]
-    return float(_fit_rotations(uv_first, uv_second, intrinsics * scale)[1].min())
+    return _fit_rotations(uv_first, uv_second, intrinsics * scale)[1]
 
 
 def _fit_rotations(
