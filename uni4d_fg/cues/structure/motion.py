@@ -123,7 +123,6 @@ def structure_from_motion(
         reporter.end()
         return None
     poses = _bridge(scene.world_T_cam, scene.registered)
-    track, points, moving = _triangulate_all(observations, poses, scene)
     mean_focal = float(np.mean(scene.intrinsics[:2]))
     rivals, focal = list[Rival](), FocalInterval(mean_focal, mean_focal)
     if with_doubts:
@@ -138,7 +137,7 @@ def structure_from_motion(
             scene.hold_focal(likely)
             sigma = scene.measure_noise()
             poses = _bridge(scene.world_T_cam, scene.registered)
-            track, points, moving = _triangulate_all(observations, poses, scene)
+    track, points, moving = _triangulate_all(observations, poses, scene)
     reporter.end()
     return Structure(
         poses, scene.intrinsics, scene.registered, track, points, moving, sigma, best.pair, focal, best.unexplained,

@@ -111,9 +111,14 @@ def refine_structure(
 def relift_structure(state: State, observations: Observations) -> State:
     """Put every landmark at the mean lift of its depth cues, where it has any."""
     landmarks = state[LANDMARK]
-    _, row = observations.rows()
-    lifted = mean_per_row(lift(observations, Cameras.of(state)), observations.weight, row, len(landmarks))
+    lifted = _mean_lift(observations, Cameras.of(state))
     return state.replace({LANDMARK: np.where(np.isfinite(lifted), lifted, landmarks)})
+
+
+def _mean_lift(observations: Observations, cameras: Cameras) -> FloatArray:
+    """Return where the depth cues of every track lift it to, (M, 3), as a mean by weight; NaN without any."""
+    tracks, row = observations.rows()
+    return mean_per_row(lift(observations, cameras), observations.weight, row, len(tracks))
 
 
 def liftable(
@@ -124,7 +129,7 @@ def liftable(
     observations = observations.with_min_observations(min(config.min_observations, len(cameras.world_T_cam)))
     tracks, row = observations.rows()
     dropped["track with too few observations"] = before - len(tracks)
-    landmarks = mean_per_row(lift(observations, cameras), observations.weight, row, len(tracks))
+    landmarks = _mean_lift(observations, cameras)
     known = np.asarray(np.isfinite(landmarks).all(axis=1))
     dropped["track without depth"] = int((~known).sum())
     return observations.select(known[row]), landmarks[known]
@@ -162,9 +167,8 @@ def further_landmarks(
     points, kept, solves = [], [], []
     for part in range(parts):
         some = observations.select(row % parts == part)  # of every frame alike, for weights by frame
-        named, of = some.rows()
-        landmarks = mean_per_row(lift(some, Cameras.of(state)), some.weight, of, len(named))
-        own = State({**state.arrays, LANDMARK: landmarks}, {**state.index, LANDMARK: named})
+        landmarks = _mean_lift(some, Cameras.of(state))
+        own = State({**state.arrays, LANDMARK: landmarks}, {**state.index, LANDMARK: some.rows()[0]})
         for solver in (early(config.structure_solver), config.structure_solver):
             problem = structure_problem(own, some, noise, config).fix(LOG_SCALE)
             return_free_memory(LARGE)
