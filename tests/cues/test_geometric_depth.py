@@ -14,7 +14,7 @@ from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
-from uni4d_fg.cues.depth_settings import settings_for_depth
+from uni4d_fg.cues.depth_settings import settings_behind_lens, settings_for_depth
 from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.interpolated_depth import (
     SparseInverseDepth,
@@ -193,12 +193,32 @@ def test_settings_loosen_moving_depth_and_keep_a_focal_length_that_motion_does_n
     assert settings_for_depth(config, seen).nonrigid.depth_sigma == config.geometric_depth.moving_depth_sigma
     assert settings_for_depth(config, seen).input.intrinsics == "free"
     assert settings_for_depth(config, unseen).input.intrinsics == "fixed"
-    assert settings_for_depth(config, replace(seen, focal_is_open=True)).input.intrinsics == "fixed"
-    aligned = settings_for_depth(config, replace(given, focal_is_open=True))  # a network's depth, scaled by motion
+    assert settings_for_depth(config, replace(seen, focal_sigma=0.01)).input.intrinsics == "free"  # for a lens
+    assert settings_for_depth(config, replace(seen, focal_sigma=0.05)).input.intrinsics == "fixed"
+    aligned = settings_for_depth(config, replace(given, focal_sigma=0.05))  # a network's depth, scaled by motion
     assert aligned.input.intrinsics == "fixed"
     assert aligned.nonrigid.depth_sigma is None
     own = load_config("default", ["nonrigid.depth_sigma=0.02"])
     assert settings_for_depth(own, seen).nonrigid.depth_sigma == 0.02
+
+
+def test_behind_the_lens_what_motion_told_is_no_cue_for_the_cameras() -> None:
+    config = load_config("default", [])
+    given = make_synthetic_sequence(SyntheticSceneConfig(num_frames=2, width=64, height=48, render_images=False))
+    seen = replace(given, depth_parallax=True, focal_sigma=0.01)
+    assert settings_behind_lens(config, given, depth_is_needed=False) == config
+    stages = settings_behind_lens(config, seen, depth_is_needed=False)
+    assert (stages.input.intrinsics, stages.bundle_adjustment.depth_prior) == ("fixed", False)
+    needed = settings_behind_lens(config, seen, depth_is_needed=True)
+    assert (needed.input.intrinsics, needed.bundle_adjustment.depth_prior) == ("fixed", True)
+    asked = settings_behind_lens(
+        load_config("default", ["geometric_depth.depth_prior=true"]), seen, depth_is_needed=False
+    )
+    assert asked.bundle_adjustment.depth_prior
+    turns = settings_behind_lens(config, replace(seen, depth_parallax=False), depth_is_needed=False)
+    assert turns.bundle_adjustment.depth_prior  # depth by convention is all that holds the points
+    aligned = settings_behind_lens(config, replace(given, focal_sigma=0.01), depth_is_needed=False)
+    assert (aligned.input.intrinsics, aligned.bundle_adjustment.depth_prior) == ("fixed", True)
 
 
 def plane(uv: np.ndarray) -> np.ndarray:

@@ -97,8 +97,10 @@ def test_a_focal_length_of_which_tracks_say_nothing_is_the_usual_one() -> None:
     interval = FocalInterval(100.0, 900.0, True, True, float("nan"))
     assert interval.is_wide
     assert interval.likely(700.0, 500.0, 0.3) == 500.0
+    assert interval.likely_sigma(0.3) == 0.3
     half = FocalInterval(100.0, 900.0, deviation=0.3)
     assert half.likely(800.0, 200.0, 0.3) == pytest.approx(400.0)
+    assert half.likely_sigma(0.3) == pytest.approx(0.3 / np.sqrt(2.0))
 
 
 @pytest.mark.parametrize("seed", [1, 2])

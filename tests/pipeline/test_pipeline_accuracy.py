@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,12 @@ from pipeline_scenes import (
     SMALL,
     TINY,
     check_run,
+    depth_of,
     make_config,
     make_scene,
     run_sound,
     solves_of,
+    with_depth,
     with_true_poses,
 )
 
@@ -247,3 +250,21 @@ def test_a_run_with_views_writes_them(tmp_path: Path) -> None:
     reconstruct(shorter, tmp_path, make_config("output.clouds=true"))
     assert sorted(path.name for path in folder.dynamic_cloud(0).parent.iterdir()) == [f"{t:05d}.ply" for t in range(2)]
     assert not folder.scene_picture.exists()
+
+
+def test_depth_from_motion_that_is_wrong_behind_edges_bends_no_cameras(tmp_path: Path) -> None:
+    size = {"num_frames": 20, "grid_columns": 24, "grid_rows": 18}
+    scene = make_scene(size, objects="none", noise=CueNoise.none())
+    truth, depth = scene.ground_truth.intrinsics, depth_of(scene)
+    assert truth is not None
+    # What is far is interpolated towards what is near beside it.
+    wrong = np.where(depth > np.nanquantile(depth, 0.6), 0.9 * depth, depth)
+    seen = dataclasses.replace(with_depth(scene, wrong), depth_parallax=True, focal_sigma=0.01, intrinsics=truth)
+    as_cue = score(seen, tmp_path / "as_cue", "geometric_depth.depth_prior=true")
+    found = score(seen, tmp_path / "found")
+    assert found.focal_error == 0.0
+    assert found.relative_ate < 5e-7
+    assert found.relative_ate < as_cue.relative_ate / 10.0
+    covariance = found.result.intrinsics_covariance
+    assert covariance is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[:2]), 0.01 * truth[:2], rtol=0.01)

@@ -48,6 +48,9 @@ class GeometricDepthConfig(Section):
         0.2, "Points whose inverse depth has a larger standard deviation than this part of the frame's median are "
         "not interpolated.", gt=0,
     )  # fmt: skip
+    depth_prior: bool = setting(
+        False, "Bundle adjustment takes depth from motion for a depth cue like any other. Windows always do."
+    )
     max_depth_ratio: float = setting(
         10.0, "Depth beyond this many times the frame's median is cut there: parallax does not see so far.", gt=1
     )

@@ -1,28 +1,49 @@
-"""The configuration that depth from camera motion asks for."""
+"""The configuration that depth and intrinsics from camera motion ask for."""
 
 from __future__ import annotations
 
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.structure.focal_interval import NARROW
 from uni4d_fg.frontend.sequence.model import Sequence
 
 
 def settings_for_depth(config: Config, sequence: Sequence) -> Config:
     """Return the configuration with which to reconstruct from a depth cue.
 
-    Stages 1 and 2 take depth from motion like any other: they measure its noise. But moving things have depth only
-    where they stand, and the noise of the static scene says nothing of that (``geometric_depth.moving_depth_sigma``
-    does, unless ``nonrigid.depth_sigma`` is set). Without parallax, depth is a convention that would bend the focal
-    lengths: they are kept. So are those that the motion leaves open: stage 2 takes the tracks for independent, and
-    would go to the focal length that their common errors ask for.
+    Stages measure the noise of depth from motion like that of any other. But moving things have depth only where they
+    stand, and the noise of the static scene says nothing of that (``geometric_depth.moving_depth_sigma`` does, unless
+    ``nonrigid.depth_sigma`` is set). Without parallax, depth is a convention that would bend the focal lengths: they
+    are kept, and no lens is sought. So are those that the motion leaves open.
 
     Args:
         config: Of the run.
-        sequence: Its fields ``depth_parallax`` and ``focal_is_open`` say where depth and intrinsics are from.
+        sequence: Its fields ``depth_parallax`` and ``focal_sigma`` say where depth and intrinsics are from.
     """
     update: dict[str, object] = {}
     if sequence.depth_parallax is not None and config.nonrigid.depth_sigma is None:
         sigma = config.geometric_depth.moving_depth_sigma
         update["nonrigid"] = config.nonrigid.model_copy(update={"depth_sigma": sigma})
-    if sequence.depth_parallax is False or sequence.focal_is_open:
+    if sequence.depth_parallax is False or (sequence.focal_sigma or 0.0) > NARROW:
         update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
+    return config.model_copy(update=update)
+
+
+def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed: bool) -> Config:
+    """Return the configuration of stages 1 to 3, once lens and zoom are known.
+
+    Intrinsics from motion are kept: they are from the tracks that agree with most others, and a stage that takes all
+    tracks for independent would go to the focal length that their common errors ask for. And depth from motion is no
+    cue for the cameras: what is interpolated between points that were found with them knows nothing that the tracks do
+    not know, and is wrong behind every edge.
+
+    Args:
+        config: Of the run, as :func:`settings_for_depth` returns it.
+        sequence: Its fields ``depth_parallax`` and ``focal_sigma`` say where depth and intrinsics are from.
+        depth_is_needed: Whether what the run does relies on a depth prior for the scale of the world.
+    """
+    update: dict[str, object] = {}
+    if sequence.focal_sigma is not None:
+        update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
+    if sequence.depth_parallax and not (config.geometric_depth.depth_prior or depth_is_needed):
+        update["bundle_adjustment"] = config.bundle_adjustment.model_copy(update={"depth_prior": False})
     return config.model_copy(update=update)

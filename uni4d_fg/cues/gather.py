@@ -92,7 +92,7 @@ class _Gathering:
             self.report.metric = False
             self.report.warnings.append(NOT_METRIC_GIVEN)
         self.depth_parallax = video.depth_parallax if plan.depth == "given" else None
-        self.focal_is_open = plan.depth == "given" and video.focal_is_open
+        self.focal_sigma = video.focal_sigma if plan.depth == "given" else None
         self.tracks = video.tracks if plan.tracks == "given" else None
         self.track_file: Path | None = None
         self.intrinsics = video.intrinsics
@@ -135,7 +135,7 @@ class _Gathering:
             replace(
                 self.video, depths=depths, masks=masks, intrinsics=self._best_intrinsics(), tracks=self.tracks,
                 initial_world_T_cam=self.world_T_cam, content=None, depth_is_metric=report.metric,
-                depth_parallax=self.depth_parallax, focal_is_open=self.focal_is_open,
+                depth_parallax=self.depth_parallax, focal_sigma=self.focal_sigma,
             )
         )  # fmt: skip
         if not plan.is_given:
@@ -237,7 +237,7 @@ class _Gathering:
         self.motion_has_parallax = found.has_parallax
         self.cameras_of_motion = found.world_T_cam
         self.moving_tracks = found.moving
-        self.intrinsics_of_motion, self.focal_is_open = found.intrinsics, found.focal_is_open
+        self.intrinsics_of_motion, self.focal_sigma = found.intrinsics, found.focal_sigma
         if video.intrinsics is None:
             report.sources["intrinsics"] = "from camera motion"
         self.motion_facts = [f"depth: {fact}" for fact in found.facts]

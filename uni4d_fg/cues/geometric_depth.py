@@ -61,8 +61,8 @@ class GeometricDepth:
     """(K,) tracks that contradict a static scene."""
     has_parallax: bool
     """False if the camera stays in one place, so that depth is a convention."""
-    focal_is_open: bool
-    """Whether the motion tells the focal length so poorly that what cameras usually have was weighed in."""
+    focal_sigma: float
+    """Standard deviation of the log of the focal lengths that were found; 0 for those that were held."""
     facts: tuple[str, ...]
     """What was found, one line each."""
     warnings: tuple[str, ...]
@@ -159,7 +159,7 @@ def _with_maps(
     moving = np.zeros(tracks.num_tracks, dtype=bool)
     moving[structure.track] = structure.moving
     return GeometricDepth(
-        depths, structure.world_T_cam, structure.intrinsics, sparse, moving, True, structure.focal.is_wide, facts,
+        depths, structure.world_T_cam, structure.intrinsics, sparse, moving, True, structure.focal_sigma, facts,
         warnings, start,
     )  # fmt: skip
 
@@ -290,7 +290,7 @@ def _without_parallax(
         f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
     )
     moving = np.zeros(tracks.num_tracks, dtype=bool)
-    return GeometricDepth(depths, poses, intrinsics, sparse, moving, False, False, ("no parallax",), warnings)
+    return GeometricDepth(depths, poses, intrinsics, sparse, moving, False, 0.0, ("no parallax",), warnings)
 
 
 def _on_sphere(uv: FloatArray, intrinsics: FloatArray, radius: float) -> FloatArray:

@@ -77,7 +77,7 @@ def geometric_depth(
         cache.put_arrays(
             _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
             moving=result.moving, has_parallax=np.array([result.has_parallax]),
-            focal_is_open=np.array([result.focal_is_open]), said=np.array(said), **arrays,
+            focal_sigma=np.array([result.focal_sigma]), said=np.array(said), **arrays,
         )  # fmt: skip
         stored = _stored_structure(cache, tracks, leads_to_masks)
         assert stored is not None
@@ -90,7 +90,7 @@ def geometric_depth(
     return GeometricDepth(
         depths, stored["world_T_cam"], stored["intrinsics"],
         stored["sparse"].astype(np.float32), stored["moving"], bool(stored["has_parallax"][0]),
-        bool(stored["focal_is_open"][0]), tuple(facts), tuple(warnings), start,
+        float(stored["focal_sigma"][0]), tuple(facts), tuple(warnings), start,
     )  # fmt: skip
 
 
@@ -105,7 +105,7 @@ def _grids(depths: FrameSource[Float32Array], reporter: Reporter, should_stop: S
 
 def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> dict[str, npt.NDArray[Any]] | None:
     ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "moving": 1, "said": None}
-    ranks |= {"has_parallax": 1, "focal_is_open": 1}
+    ranks |= {"has_parallax": 1, "focal_sigma": 1}
     ranks |= {"grids": 3} if with_grids else {}
     stored = cache.arrays(_RECORD, ranks)
     return stored if stored is not None and stored["sparse"].shape == tracks.visible.shape else None

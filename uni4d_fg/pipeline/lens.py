@@ -49,7 +49,7 @@ class CameraModel:
             ideal = unzoomed_tracks(ideal, self.intrinsics, np.log(self.zoom))
         held = config.input.model_copy(update={"intrinsics": "fixed"})
         return (
-            replace(sequence, intrinsics=self.intrinsics, lens=PINHOLE),
+            replace(sequence, intrinsics=self.intrinsics, focal_sigma=None, lens=PINHOLE),
             ideal,
             config.model_copy(update={"input": held}),
         )

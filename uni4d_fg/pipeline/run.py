@@ -20,6 +20,7 @@ from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.counted import counted
+from uni4d_fg.cues.depth_settings import settings_behind_lens
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
 from uni4d_fg.cues.plan import CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
@@ -295,9 +296,11 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
             labelled, scene, zoomed(scene["intrinsics"], zoom, sequence.num_frames), config.fusion
         )
     )
-    key, scene, motion = _stages(
-        run, key, *camera.apply(solved, solved_tracks, config), windows, run_stage, fragments, loops, static
-    )
+    solved, solved_tracks, config = camera.apply(solved, solved_tracks, config)
+    measures_lengths = bool(windows or run.sources) or run.imu is not None
+    config = settings_behind_lens(config, sequence, depth_is_needed=measures_lengths)
+    key = stage_key(key, config.input, sequence.focal_sigma)
+    key, scene, motion = _stages(run, key, solved, solved_tracks, config, windows, run_stage, fragments, loops, static)
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)
     adjusted = summary.stages["bundle_adjustment"]

@@ -113,7 +113,7 @@ def bundle_adjustment_step(
         return _with_imu(sequence, labelled, start, freedom, config, hooks, run, imu, find_fragments)
     try:
         solver = StaticSceneSolver(config, run, hooks, find_fragments=find_fragments, timestamps=sequence.timestamps)
-        scene = solver.adjust(labelled, start, sequence.intrinsics, freedom)
+        scene = solver.adjust(labelled, start, sequence.intrinsics, freedom, sequence.focal_sigma)
     except DegenerateProblemError as reason:
         if not fixed:
             raise

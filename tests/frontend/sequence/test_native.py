@@ -441,20 +441,23 @@ def test_depth_from_motion_says_so_in_the_folder(tmp_path: Path, parallax: bool)
         note.write_text(text)
         with pytest.raises(InputError, match=r"depth_cue\.json: does not say whether the motion showed parallax"):
             read_native(folder)
-    note.write_text('{"metric": false, "from_motion": {"parallax": true, "focal_is_open": 1}}')
-    with pytest.raises(InputError, match="whether the motion leaves the focal length open"):
-        read_native(folder)
     note.write_text('{"metric": false}')
     assert read_native(folder).depth_parallax is None
 
 
-@pytest.mark.parametrize("is_open", [True, False])
-def test_a_focal_length_that_motion_leaves_open_says_so_in_the_folder(tmp_path: Path, is_open: bool) -> None:
+@pytest.mark.parametrize("parallax", [True, None])
+@pytest.mark.parametrize("sigma", [0.0, 0.0123, None])
+def test_how_well_motion_tells_the_focal_length_is_in_the_folder(
+    tmp_path: Path, parallax: bool | None, sigma: float | None
+) -> None:
     folder = tmp_path / "sequence"
-    sequence = dataclasses.replace(sample_sequence(), depth_is_metric=False, depth_parallax=True, focal_is_open=is_open)
-    write_native(sequence, folder)
-    assert read_native(folder).focal_is_open is is_open
-    assert ("focal_is_open" in (folder / "depth_cue.json").read_text()) is is_open
+    sample = dataclasses.replace(sample_sequence(), depth_is_metric=False, depth_parallax=parallax, focal_sigma=sigma)
+    write_native(sample, folder)
+    assert read_native(folder).focal_sigma == sigma
+    for wrong in ("true", "-0.1", '"0.1"', "1e999"):
+        (folder / "depth_cue.json").write_text(f'{{"metric": false, "focal_sigma": {wrong}}}')
+        with pytest.raises(InputError, match="the standard deviation of the log focal length"):
+            read_native(folder)
 
 
 def test_the_note_is_of_the_usual_depth_alone(tmp_path: Path) -> None:

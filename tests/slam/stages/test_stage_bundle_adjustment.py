@@ -252,3 +252,30 @@ def test_the_motion_prior_alone_places_a_frame_without_tracks(exact: LabelledTra
     middle = 0.5 * (result.cameras.world_T_cam[3, :3, 3] + result.cameras.world_T_cam[5, :3, 3])
     step = np.linalg.norm(result.cameras.world_T_cam[5, :3, 3] - result.cameras.world_T_cam[3, :3, 3])
     assert np.linalg.norm(result.cameras.world_T_cam[4, :3, 3] - middle) < 0.25 * step
+
+
+def test_covariances_allow_for_a_focal_length_that_is_held_and_known_to_some_part(
+    exact: LabelledTracks, start: np.ndarray, rng: np.random.Generator
+) -> None:
+    noisy = static_observations(shift(exact, rng.normal(scale=0.01, size=(TRACKS, FRAMES, 2)).astype(np.float32)))
+    config, sigma = changed(depth_prior=False, covariance_cells=0), 0.02
+
+    def held(intrinsics: np.ndarray, focal_sigma: float | None) -> StaticScene:
+        return adjust_bundle(
+            noisy, Cameras(start, intrinsics, np.zeros(FRAMES)), K, config, Freedom(True, False),
+            focal_sigma=focal_sigma,
+        )  # fmt: skip
+
+    known, unsure = held(K, None), held(K, sigma)
+    np.testing.assert_array_equal(unsure.cameras.world_T_cam, known.cameras.world_T_cam)
+    np.testing.assert_array_equal(held(K, 0.0).pose_covariance, known.pose_covariance)
+    focal = np.sqrt(np.diag(unsure.intrinsics_covariance))
+    np.testing.assert_allclose(focal[:2], sigma * K[:2], rtol=1e-2)
+    np.testing.assert_array_equal(focal[2:], 0.0)
+    # What is added is how the poses follow the focal lengths: by finite differences, solved anew.
+    step = 1e-3 * np.array([1.0, 1.0, 0.0, 0.0])
+    ends = [held(K * (1.0 + sign * step), None).cameras.world_T_cam for sign in (1.0, -1.0)]
+    follows = se3.se3_log(np.linalg.inv(ends[1]) @ ends[0]) / 2e-3
+    added = np.sqrt(np.diagonal(unsure.pose_covariance - known.pose_covariance, axis1=1, axis2=2))
+    large = np.abs(follows) > 0.1 * np.abs(follows).max()
+    np.testing.assert_allclose(added[large], sigma * np.abs(follows)[large], rtol=0.1)

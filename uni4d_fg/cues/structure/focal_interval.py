@@ -38,7 +38,7 @@ _SHARED = 2.0
 """On 34 random synthetic clips half of the errors of f were above 1.8 standard deviations, and not above 0.7."""
 _CELLS = 8
 """Parts of the image along its longer side whose tracks may err alike."""
-_NARROW = 0.03
+NARROW = 0.03
 """Up to this standard deviation of log f, E(f) is as good as quadratic."""
 _FIRST_STEP = 0.03
 """Step of log f with which the search for an end of the interval begins, at least ..."""
@@ -65,7 +65,7 @@ class FocalInterval:
     @property
     def is_wide(self) -> bool:
         """Whether the tracks tell the focal length so poorly that what cameras usually have says something, too."""
-        return not self.deviation <= _NARROW
+        return not self.deviation <= NARROW
 
     def likely(self, focal: float, usual: float, sigma: float) -> float:
         """Return the most likely focal length, px, of a focal length that was found and one that cameras usually have.
@@ -79,6 +79,11 @@ class FocalInterval:
             return usual
         weight = sigma**2 / (sigma**2 + self.deviation**2)
         return float(np.exp(weight * np.log(focal) + (1.0 - weight) * np.log(usual)))
+
+    def likely_sigma(self, sigma: float) -> float:
+        """Return the standard deviation of the log of :meth:`likely`."""
+        own = self.deviation
+        return own * sigma / float(np.hypot(own, sigma)) if np.isfinite(own) else sigma
 
     def relative(self, focal: float) -> tuple[float, float]:
         """Return by which part the ends are below (negative) and above a focal length."""
@@ -111,7 +116,7 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
         noise = max(noise, (clustered_deviation(scene, stage, state) / independent) ** 2)
     noise *= _SHARED**2
     deviation = independent * np.sqrt(noise)
-    if deviation <= _NARROW:
+    if deviation <= NARROW:
         ends = focal * np.exp(np.array([-1.96, 1.96]) * deviation)
         return FocalInterval(float(ends[0]), float(ends[1]), deviation=deviation)
     profile = _Profile(scene, noise)

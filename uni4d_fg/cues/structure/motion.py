@@ -49,6 +49,8 @@ class Structure:
     """The two frames it started from."""
     focal: FocalInterval
     """Focal lengths that explain the tracks as well."""
+    focal_sigma: float
+    """Standard deviation of the log of the focal lengths that were found; 0 for those that were held."""
     unexplained: float
     """Part of the held-out observations of the first frames that their cameras leave unexplained, see
     :func:`~uni4d_fg.cues.structure.judging.unexplained`."""
@@ -125,23 +127,26 @@ def structure_from_motion(
     poses = _bridge(scene.world_T_cam, scene.registered)
     mean_focal = float(np.mean(scene.intrinsics[:2]))
     rivals, focal = list[Rival](), FocalInterval(mean_focal, mean_focal)
+    focal_sigma = 0.0
     if with_doubts:
         rivals = rivals_of(hypotheses, poses)
         focal = focal_interval(scene, image_size)
         if free_focal:
             usual = np.array(settings.usual_focal) * max(image_size)
             focal = focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
+            focal_sigma = focal.deviation
         if free_focal and focal.is_wide:
             likely = focal.likely(mean_focal, float(np.mean(intrinsics[:2])), settings.focal_log_sigma)
             focal = focal.holding([likely])
+            focal_sigma = focal.likely_sigma(settings.focal_log_sigma)
             scene.hold_focal(likely)
             sigma = scene.measure_noise()
             poses = _bridge(scene.world_T_cam, scene.registered)
     track, points, moving = _triangulate_all(observations, poses, scene)
     reporter.end()
     return Structure(
-        poses, scene.intrinsics, scene.registered, track, points, moving, sigma, best.pair, focal, best.unexplained,
-        rivals,
+        poses, scene.intrinsics, scene.registered, track, points, moving, sigma, best.pair, focal, focal_sigma,
+        best.unexplained, rivals,
     )  # fmt: skip
 
 

@@ -126,15 +126,16 @@ class DepthNote(NamedTuple):
     """Whether depth is in meters."""
     parallax: bool | None = None
     """See :attr:`~uni4d_fg.frontend.sequence.model.Video.depth_parallax`."""
-    focal_is_open: bool = False
-    """See :attr:`~uni4d_fg.frontend.sequence.model.Video.focal_is_open`."""
+    focal_sigma: float | None = None
+    """See :attr:`~uni4d_fg.frontend.sequence.model.Video.focal_sigma`."""
 
 
 def load_depth_note(path: Path) -> DepthNote:
     """Return what the file says.
 
     Raises:
-        InputError: If it does not say whether depth is in meters, or of which kind the motion was that it is from.
+        InputError: If it does not say whether depth is in meters, of which kind the motion was that it is from, or
+            how well that told the focal length.
     """
     note = read_json(path)
     if not isinstance(note, dict) or not isinstance(note.get("metric"), bool):
@@ -147,15 +148,15 @@ def load_depth_note(path: Path) -> DepthNote:
             path, "does not say whether the motion showed parallax",
             'write "from_motion": {"parallax": true} or {"parallax": false}, or leave it out',
         )  # fmt: skip
-    if motion is None:
-        return DepthNote(note["metric"])
-    focal_is_open = motion.get("focal_is_open", False)
-    if not isinstance(focal_is_open, bool):
+    sigma = note.get("focal_sigma")
+    is_number = isinstance(sigma, int | float) and not isinstance(sigma, bool)
+    if sigma is not None and not (is_number and 0.0 <= sigma < np.inf):
         raise SequenceProblem(
-            path, "does not say whether the motion leaves the focal length open",
-            'write "focal_is_open": true or false, or leave it out',
+            path, f"has {sigma!r} for the standard deviation of the log focal length",
+            'write "focal_sigma" as a number that is not negative, or leave it out',
         )  # fmt: skip
-    return DepthNote(note["metric"], motion["parallax"], focal_is_open)
+    parallax = None if motion is None else motion["parallax"]
+    return DepthNote(note["metric"], parallax, None if sigma is None else float(sigma))
 
 
 def frame_names(images: ImageFolder | VideoFrames) -> tuple[str, ...]:
@@ -211,7 +212,7 @@ def as_sequence(video: Video) -> Sequence:
         initial_world_T_cam=video.initial_world_T_cam,
         depth_is_metric=video.depth_is_metric,
         depth_parallax=video.depth_parallax,
-        focal_is_open=video.focal_is_open,
+        focal_sigma=video.focal_sigma,
         tracks=video.tracks,
         lens=video.lens,
         ground_truth=video.ground_truth,
@@ -265,7 +266,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
         depths=depths,
         depth_is_metric=note.metric,
         depth_parallax=note.parallax,
-        focal_is_open=note.focal_is_open,
+        focal_sigma=note.focal_sigma,
         masks=masks,
         intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
         tracks=tracks,

@@ -98,8 +98,8 @@ class Video:
     """Whether depth is in meters; else it is in a unit of its own."""
     depth_parallax: bool | None = None
     """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
-    focal_is_open: bool = False
-    """Whether the intrinsics were found from camera motion that leaves the focal length open."""
+    focal_sigma: float | None = None
+    """Standard deviation of the log focal length where camera motion told the intrinsics; else None."""
     masks: FrameSource[Int32Array] | None = None
     """T label maps (H, W), int32."""
     intrinsics: FloatArray | None = None
@@ -154,8 +154,8 @@ class Sequence:
     """Whether depth is in meters; else it is in a unit of its own."""
     depth_parallax: bool | None = None
     """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
-    focal_is_open: bool = False
-    """Whether the intrinsics were found from camera motion that leaves the focal length open."""
+    focal_sigma: float | None = None
+    """Standard deviation of the log focal length where camera motion told the intrinsics; else None."""
     tracks: Tracks | None = None
     """Long 2D point tracks, when the sequence brings them."""
     lens: Lens = PINHOLE

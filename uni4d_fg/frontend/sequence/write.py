@@ -85,8 +85,8 @@ def _write_cues(sequence: Sequence, folder: Path, names: tuple[str, ...]) -> Non
     note: dict[str, Any] = {"metric": sequence.depth_is_metric}
     if sequence.depth_parallax is not None:
         note["from_motion"] = {"parallax": sequence.depth_parallax}
-        if sequence.focal_is_open:
-            note["from_motion"]["focal_is_open"] = True
+    if sequence.focal_sigma is not None:
+        note["focal_sigma"] = sequence.focal_sigma
     if note != {"metric": True}:
         (folder / DEPTH_NOTE).write_text(json.dumps(note) + "\n", encoding="utf-8")
     _write_masks(sequence.masks, folder / "masks", names, always_rgb=False)

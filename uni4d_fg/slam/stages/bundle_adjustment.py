@@ -9,7 +9,7 @@ is the gauge; the depth prior (or, without it, the distance of the two farthest 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.optim.added_factors import HOLDS_SCALE, joined_by
 from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.problem import Problem, all_free
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.acceleration import AccelerationPrior, estimate_prior, starting_prior
@@ -32,7 +32,7 @@ from uni4d_fg.slam.stages.frame_noise import weigh_by_frame
 from uni4d_fg.slam.stages.merging import FindFragments, MergedTracks, merge_tracks
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
-from uni4d_fg.slam.stages.static_covariance import static_marginals, track_cells
+from uni4d_fg.slam.stages.static_covariance import considered_focal_lengths, static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import drop_outliers, landmark_errors, measure_noise, spatial_inliers
 from uni4d_fg.slam.stages.structure import (
     LARGE,
@@ -134,6 +134,7 @@ def adjust_bundle(
     run: StageRunner = run_stage,
     find_fragments: FindFragments | None = None,
     timestamps: FloatArray | None = None,
+    focal_sigma: float | None = None,
 ) -> StaticScene:
     """Run stage 2 from the poses and intrinsics of stage 1.
 
@@ -148,6 +149,7 @@ def adjust_bundle(
         run: What solves each declared stage.
         find_fragments: Finds tracks that are one point, before the second solve; None leaves every track its own.
         timestamps: (T,) s, for the prior on acceleration; frame numbers when None.
+        focal_sigma: Standard deviation of the log of focal lengths that are held, which the covariances allow for.
 
     Raises:
         DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
@@ -191,7 +193,8 @@ def adjust_bundle(
         if cue_holds_scale:
             state = hold_metric_scale(state)
         if index == rounds - 1 and energy.is_likelihood:
-            covariances = _covariances(stage, state, observations, config, run)
+            known_to = None if freedom.intrinsics else focal_sigma
+            covariances = _covariances(stage, state, observations, config, run, known_to)
         del problem, stage  # as large as the observations, of which the next solve has others
         state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
@@ -252,13 +255,28 @@ def hold_metric_scale(state: State) -> State:
 
 
 def _covariances(
-    stage: Stage, state: State, observations: Observations, config: BundleAdjustmentConfig, run: StageRunner
+    stage: Stage,
+    state: State,
+    observations: Observations,
+    config: BundleAdjustmentConfig,
+    run: StageRunner,
+    focal_sigma: float | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the marginal covariances of poses and intrinsics at the end of a MAP solve, added factors included."""
+    """Return the marginal covariances of poses and intrinsics at the end of a MAP solve, added factors included.
+
+    With ``focal_sigma`` the focal lengths were held, and their logarithms have that standard deviation; they count as
+    exact without.
+    """
+    considered = None
+    if focal_sigma:
+        considered = considered_focal_lengths(state[INTRINSICS][0], focal_sigma, config.aspect_prior_sigma)
+        pixel = [] if config.free_principal_point else [2, 3]
+        problem = replace(stage.problem, free={**stage.problem.free, **all_free(state, INTRINSICS)})
+        stage = replace(stage, problem=problem.fix(INTRINSICS, entries=pixel))
     joined, clusters = joined_by(run, stage, state), track_cells(observations, state[INTRINSICS][0], config)
-    marginals = static_marginals(joined.stage, joined.state, clusters)
+    marginals = static_marginals(joined.stage, joined.state, clusters, considered=considered)
     if marginals is None and joined.added:  # added variables that nothing determines say nothing of the cameras
-        marginals = static_marginals(stage, state, clusters)
+        marginals = static_marginals(stage, state, clusters, considered=considered)
     if marginals is None:
         return unknown_covariances(len(state[POSE]))
     return marginals.blocks(POSE, len(state[POSE])), marginals.blocks(INTRINSICS, 1)[0]

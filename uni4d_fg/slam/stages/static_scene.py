@@ -56,9 +56,16 @@ class StaticSceneSolver:
         )  # fmt: skip
 
     def adjust(
-        self, labelled: LabelledTracks, start: Cameras, prior_intrinsics: FloatArray, freedom: Freedom
+        self,
+        labelled: LabelledTracks,
+        start: Cameras,
+        prior_intrinsics: FloatArray,
+        freedom: Freedom,
+        focal_sigma: float | None = None,
     ) -> StaticScene:
         """Run stage 2 from given cameras.
+
+        Covariances allow for ``focal_sigma``, the standard deviation of the log of focal lengths that are held.
 
         Raises:
             DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
@@ -66,7 +73,7 @@ class StaticSceneSolver:
         """
         return adjust_bundle(
             self._observations(labelled), start, prior_intrinsics, self.config.bundle_adjustment, freedom,
-            energy_of(self.config), self.hooks, self.run, self.find_fragments, self.timestamps,
+            energy_of(self.config), self.hooks, self.run, self.find_fragments, self.timestamps, focal_sigma,
         )  # fmt: skip
 
     def solve(
