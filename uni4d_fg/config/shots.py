@@ -15,6 +15,9 @@ class ShotsConfig(Section):
     )
     min_frames: int = setting(6, "Shots with fewer frames are left out, with a warning.", ge=2, basic=True)
     width: int = setting(160, "Longer side of the images in which cuts are looked for, px.", ge=64, le=640)
+    confirming_width: int = setting(
+        320, "Longer side of the images in which a cut must be found, too, px.", ge=64, le=1280
+    )
     max_corners: int = setting(90, "Corners of a frame that are looked for in another, at most.", ge=20)
     min_corners: int = setting(12, "A frame with fewer corners shows nothing: black, white or out of focus.", ge=4)
     min_contrast: float = setting(2.0, "Standard deviation of the gray values of a frame that shows something.", ge=0)

@@ -13,7 +13,8 @@ from uni4d_fg.config.shots import ShotsConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.sequence.open_video import open_video
-from uni4d_fg.frontend.shots.cuts import Cut, find_cuts
+from uni4d_fg.frontend.shots.cuts import Cut, _Search, find_cuts
+from uni4d_fg.frontend.shots.links import small_frame
 
 CONFIG = ShotsConfig()
 HEIGHT, WIDTH = 120, 160
@@ -106,6 +107,37 @@ def test_black_frames_within_a_shot_are_no_cut() -> None:
     clip = shot(0, 40)
     clip[18:24] = 0
     assert cuts(clip) == ()
+
+
+def dissolved(one: ImageArray, other: ImageArray, length: int) -> ImageArray:
+    stop, alpha = len(one) - length, np.arange(1, length + 1)[:, None, None] / (length + 1)
+    between = (1 - alpha) * one[stop:] + alpha * other[:length]
+    return np.concatenate((one[:stop], between.astype(np.uint8), other[length:]))
+
+
+def test_corners_outlive_what_is_no_dissolve() -> None:
+    """What a dissolve found in small images is confirmed by."""
+    clip, plain = dissolved(shot(0, 32), shot(1, 32), 8), shot(0, 56)
+    cut = Cut(24, 32)
+    searches = []
+    for frames in (clip, plain):
+        search = _Search([small_frame(frame, CONFIG) for frame in frames], CONFIG)
+        search.run()
+        searches.append(search)
+    assert not searches[0].is_outlived(cut)
+    assert searches[1].is_outlived(cut)
+    found = cuts(clip)
+    assert len(found) == 1
+    assert abs(found[0].frame - cut.frame) <= 2
+
+
+def test_a_cut_that_larger_images_do_not_show_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = np.concatenate((shot(0, 20), shot(1, 20)))
+    twice = [np.ascontiguousarray(cv2.resize(frame, None, fx=2, fy=2)) for frame in clip]
+    assert find_cuts(ArrayFrames(np.stack(twice)), CONFIG) == (Cut(20, 20),)
+    run = _Search.run
+    monkeypatch.setattr(_Search, "run", lambda self: run(self) if max(self.frames[0].size) <= CONFIG.width else ())
+    assert find_cuts(ArrayFrames(np.stack(twice)), CONFIG) == ()
 
 
 def test_a_search_can_be_stopped() -> None:

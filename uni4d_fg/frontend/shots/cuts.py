@@ -7,6 +7,9 @@ its frames. Across a dissolve every frame is connected with the next, but no cor
 other (:mod:`uni4d_fg.frontend.shots.survival`), and what lies between is a blend of both,
 ``I_s = alpha A + beta B + c`` (both moved along with the camera). In ordinary motion A and B show the same things, so
 that both together explain hardly more of a frame between them than one of them does; in a dissolve they do not.
+
+Small images do for almost all of that. But grass and leaves have corners that are lost in them at every step, so that
+what is found is looked for once more in larger images of the frames around it, and must be seen there, too.
 """
 
 from __future__ import annotations
@@ -49,7 +52,7 @@ class Cut:
 def find_cuts(
     images: FrameSource[ImageArray], config: ShotsConfig, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Cut, ...]:
-    """Find the cuts of a video, in order; each frame is read once.
+    """Find the cuts of a video, in order; each frame is read once, and those around a cut once more.
 
     Args:
         images: T images (H, W, 3) or (H, W), uint8.
@@ -60,14 +63,36 @@ def find_cuts(
         InputError: If a frame cannot be read.
         Cancelled: If ``should_stop`` said so.
     """
-    frames = []
-    for number, image in enumerate(images):
-        if should_stop is not None and should_stop():
-            raise Cancelled(f"the search for cuts stopped at frame {number} of {len(images)}")
-        frames.append(small_frame(image, config))
+    frames = _small_frames(images, range(len(images)), config, should_stop)
     if len(frames) < 2:
         return ()
-    return _Search(frames, config).run()
+    cuts = _Search(frames, config).run()
+    return tuple(cut for cut in cuts if _is_confirmed(cut, images, config, should_stop))
+
+
+def _small_frames(
+    images: FrameSource[ImageArray], which: range, config: ShotsConfig, should_stop: Callable[[], bool] | None
+) -> list[SmallFrame]:
+    """Read frames and make them small, one after the other."""
+    frames = []
+    for number in which:
+        if should_stop is not None and should_stop():
+            raise Cancelled(f"the search for cuts stopped at frame {number} of {len(images)}")
+        frames.append(small_frame(images[number], config))
+    return frames
+
+
+def _is_confirmed(
+    cut: Cut, images: FrameSource[ImageArray], config: ShotsConfig, should_stop: Callable[[], bool] | None
+) -> bool:
+    """Tell whether a cut is found in larger images of the frames around it as well, or no corner outlives it there."""
+    reach = max(config.dissolve_spans) if cut.start > cut.stop else 2 * config.look_around
+    around = range(max(0, cut.stop - reach), min(len(images), cut.start + reach))
+    larger = config.model_copy(update={"width": config.confirming_width})
+    search = _Search(_small_frames(images, around, larger, should_stop), larger)
+    there = Cut(cut.stop - around.start, cut.start - around.start)
+    found = any(c.stop <= there.start and there.stop <= c.start for c in search.run())
+    return found or (cut.start > cut.stop and not search.is_outlived(there))
 
 
 @dataclass(frozen=True)
@@ -153,13 +178,26 @@ class _Search:
         shares, _, _ = self.blend(a, b)
         return bool(shares[:2].max() < 0.25 and shares[2:].min() > 0.75)
 
+    def is_outlived(self, cut: Cut) -> bool:
+        """Tell whether more corners outlive the shortest spans across a dissolve than do if it is one."""
+        across = [
+            s for s in spans(self.frames, self.steps(), self.config) if s.first < cut.stop and s.last >= cut.start
+        ]
+        shortest = min((s.last - s.first for s in across), default=0)
+        return bool(across) and all(s.alive > 2.0 * self.surviving(s) for s in across if s.last - s.first == shortest)
+
+    def surviving(self, span: Span) -> float:
+        """Return the part of the corners that outlives a span across a dissolve, at most.
+
+        The longer the span, the fewer corners outlive it in a video without any cut.
+        """
+        return self.config.max_surviving * min(self.config.dissolve_spans) / (span.last - span.first)
+
     def dissolves(self) -> list[Cut]:
         found: list[_Dissolve] = []
-        shortest = min(self.config.dissolve_spans)
         followed = list(spans(self.frames, self.steps(), self.config))
         for span in [*followed, *self.gaps]:
-            # The longer the span, the fewer corners outlive it in a video without any cut.
-            limit = self.config.max_surviving * shortest / (span.last - span.first)
+            limit = self.surviving(span)
             candidate = self.dissolve(span) if span.alive <= 2.0 * limit else None
             if candidate is not None and (span.alive <= limit or candidate.explained >= self.config.sure_blend):
                 found.append(candidate)
