@@ -31,8 +31,9 @@ def settings_for_depth(config: Config, sequence: Sequence) -> Config:
 def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed: bool) -> Config:
     """Return the configuration of stages 1 to 3, once lens and zoom are known.
 
-    Intrinsics from motion are kept: they are from the tracks that agree with most others, and a stage that takes all
-    tracks for independent would go to the focal length that their common errors ask for. And depth from motion is no
+    Cameras from motion are from the tracks that agree with most others: those that do not are left out here, too
+    (``bundle_adjustment.trim_sigmas``). Their intrinsics are kept, as a stage that takes all tracks for independent
+    would go to the focal length that their common errors ask for. And depth from motion is no
     cue for the cameras: what is interpolated between points that were found with them knows nothing that the tracks do
     not know, and is wrong behind every edge.
 
@@ -44,6 +45,10 @@ def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed:
     update: dict[str, object] = {}
     if sequence.focal_sigma is not None:
         update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
+    stage: dict[str, object] = {}
+    if sequence.focal_sigma is not None and config.bundle_adjustment.trim_sigmas is None:
+        stage["trim_sigmas"] = config.geometric_depth.stage_trim_sigmas
     if sequence.depth_parallax and not (config.geometric_depth.depth_prior or depth_is_needed):
-        update["bundle_adjustment"] = config.bundle_adjustment.model_copy(update={"depth_prior": False})
+        stage["depth_prior"] = False
+    update["bundle_adjustment"] = config.bundle_adjustment.model_copy(update=stage)
     return config.model_copy(update=update)

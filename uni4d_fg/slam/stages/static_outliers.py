@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray, rows_by_group
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.factors.depth_prior import log_depth
 from uni4d_fg.factors.state import State
@@ -65,18 +65,37 @@ def drop_outliers(
     known = np.isfinite(ratio)
     wrong = np.bincount(row[known], ratio[known] > np.log(config.max_depth_ratio), len(tracks))
     contradicted = (wrong > 0.5 * np.bincount(row[known], minlength=len(tracks))) & (wrong > 0)
-    keep = ~(behind | far | contradicted[row])
+    astray = _astray(residual, observations, row, len(state[POSE]), config) & ~contradicted
+    keep = ~(behind | far | (contradicted | astray)[row])
     kept = observations.select(keep).with_min_observations(min(config.min_observations, len(state[POSE])))
     stays = np.isin(tracks, kept.track)
     for reason, count in (
         ("observation behind the camera", int(behind.sum())),
         ("observation with a large reprojection error", int(far.sum())),
         ("landmark whose depth contradicts the cue", int(contradicted.sum())),
-        ("landmark left with too few observations", int((~stays & ~contradicted).sum())),
+        ("landmark that departs from the others", int(astray.sum())),
+        ("landmark left with too few observations", int((~stays & ~contradicted & ~astray).sum())),
     ):
         dropped[reason] = dropped.get(reason, 0) + count
     arrays = {**state.arrays, LANDMARK: state[LANDMARK][stays]}
     return State(arrays, {**state.index, LANDMARK: tracks[stays]}), kept
+
+
+def _astray(
+    residual: FloatArray, observations: Observations, row: IntArray, num_frames: int, config: BundleAdjustmentConfig
+) -> BoolArray:
+    """Return the landmarks (M,) of which most observations, off by ``residual`` (N, 2) px, are beyond the noise.
+
+    The noise is that of all, or of a frame that has more: what is blurred is not to lose its camera.
+    """
+    count = np.bincount(row)
+    if config.trim_sigmas is None:
+        return np.zeros(len(count), np.bool_)
+    everywhere = max(robust_sigma(residual), config.min_reprojection_sigma_px)
+    groups = rows_by_group(observations.frame, num_frames)
+    noise = np.array([max(robust_sigma(residual[rows]), everywhere) if len(rows) else everywhere for rows in groups])
+    beyond = np.linalg.norm(residual, axis=1) > config.trim_sigmas * noise[observations.frame]
+    return np.asarray(np.bincount(row, beyond) > 0.5 * count)
 
 
 def measure_noise(
