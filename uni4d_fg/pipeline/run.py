@@ -273,12 +273,11 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
         key = _repair_masks(run, key)
         sequence = run.sequence
     key, labelled = _labels(run, key, images)
-    key = stage_key(
-        key, config.camera_init, config.input, config.energy, config.normalization, *solver_settings(config)
-    )
+    energy = (config.energy, config.normalization)
+    key = stage_key(key, config.camera_init, config.input, *energy, *solver_settings(config))
     # What is added to stages, windows included, counts the frames of the video: none is left out there.
-    alone = config.input.repeated_frames == "auto" and not (windows or run.sources or run.imu is not None)
-    repeats = Repeats.of(sequence, labelled) if alone else None
+    alone = not (windows or run.sources or run.imu is not None)
+    repeats = Repeats.of(sequence, labelled) if alone and config.input.repeated_frames == "auto" else None
     solved, solved_tracks = sequence, labelled
     if repeats is not None:
         solved, solved_tracks = repeats.sequence(sequence), repeats.labelled(labelled)
@@ -297,16 +296,14 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
         )
     )
     solved, solved_tracks, config = camera.apply(solved, solved_tracks, config)
-    measures_lengths = bool(windows or run.sources) or run.imu is not None
-    config = settings_behind_lens(config, sequence, depth_is_needed=measures_lengths)
+    config = settings_behind_lens(config, sequence, depth_is_needed=not alone)
     key = stage_key(key, config.input, sequence.focal_sigma)
     key, scene, motion = _stages(run, key, solved, solved_tracks, config, windows, run_stage, fragments, loops, static)
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)
     adjusted = summary.stages["bundle_adjustment"]
     adjusted["facts"] = [*adjusted.get("facts", []), *measured.facts]
-    key = stage_key(key, config.fusion)
-    _fuse(run, key, labelled, scene, motion, zoom, camera.lens, static)
+    _fuse(run, stage_key(key, config.fusion), labelled, scene, motion, zoom, camera.lens, static)
     reconstruction = assemble(sequence, labelled, scene, motion, camera.lens, zoom)
     write_result(folder, reconstruction)
     began = time.perf_counter()
