@@ -134,9 +134,9 @@ class BundleAdjustmentConfig(Section):
     max_reprojection_px: float = setting(
         8.0, "Observations above this after the first solve are dropped, px.", gt=0, basic=True
     )
-    trim_sigmas: PositiveFloat | None = setting(
+    trim_sigmas: float | None = setting(
         None, "Landmarks of which most observations are farther off than so many times the noise of their frames are "
-        "dropped; null keeps them.",
+        "dropped; null keeps them.", gt=0,
     )  # fmt: skip
     min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2, basic=True)
     max_depth_ratio: float = setting(

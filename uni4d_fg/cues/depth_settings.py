@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.focal_interval import NARROW
 from uni4d_fg.frontend.sequence.model import Sequence
+
+OPEN_FOCAL_SIGMA = 0.03
+"""Standard deviation of the log focal length beyond which camera motion leaves it open."""
 
 
 def settings_for_depth(config: Config, sequence: Sequence) -> Config:
@@ -23,7 +25,7 @@ def settings_for_depth(config: Config, sequence: Sequence) -> Config:
     if sequence.depth_parallax is not None and config.nonrigid.depth_sigma is None:
         sigma = config.geometric_depth.moving_depth_sigma
         update["nonrigid"] = config.nonrigid.model_copy(update={"depth_sigma": sigma})
-    if sequence.depth_parallax is False or (sequence.focal_sigma or 0.0) > NARROW:
+    if sequence.depth_parallax is False or (sequence.focal_sigma or 0.0) > OPEN_FOCAL_SIGMA:
         update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
     return config.model_copy(update=update)
 
@@ -33,9 +35,9 @@ def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed:
 
     Cameras from motion are from the tracks that agree with most others: those that do not are left out here, too
     (``bundle_adjustment.trim_sigmas``). Their intrinsics are kept, as a stage that takes all tracks for independent
-    would go to the focal length that their common errors ask for. And depth from motion is no
-    cue for the cameras: what is interpolated between points that were found with them knows nothing that the tracks do
-    not know, and is wrong behind every edge.
+    would go to the focal length that their common errors ask for. And depth from motion is no cue for the cameras: what
+    is interpolated between points that were found with them knows nothing that the tracks do not know, and is wrong
+    behind every edge.
 
     Args:
         config: Of the run, as :func:`settings_for_depth` returns it.
@@ -43,11 +45,11 @@ def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed:
         depth_is_needed: Whether what the run does relies on a depth prior for the scale of the world.
     """
     update: dict[str, object] = {}
+    stage: dict[str, object] = {}
     if sequence.focal_sigma is not None:
         update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
-    stage: dict[str, object] = {}
-    if sequence.focal_sigma is not None and config.bundle_adjustment.trim_sigmas is None:
-        stage["trim_sigmas"] = config.geometric_depth.stage_trim_sigmas
+        if config.bundle_adjustment.trim_sigmas is None:
+            stage["trim_sigmas"] = config.geometric_depth.stage_trim_sigmas
     if sequence.depth_parallax and not (config.geometric_depth.depth_prior or depth_is_needed):
         stage["depth_prior"] = False
     update["bundle_adjustment"] = config.bundle_adjustment.model_copy(update=stage)

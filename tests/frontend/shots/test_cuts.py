@@ -41,6 +41,12 @@ def shot(seed: int, frames: int, speed: float = 1.0) -> ImageArray:
     return np.stack([view(picture, 100 + speed * t) for t in range(frames)])
 
 
+def dissolved(one: ImageArray, other: ImageArray, length: int) -> ImageArray:
+    stop, alpha = len(one) - length, np.arange(1, length + 1)[:, None, None] / (length + 1)
+    between = (1 - alpha) * one[stop:] + alpha * other[:length]
+    return np.concatenate((one[:stop], between.astype(np.uint8), other[length:]))
+
+
 def cuts(frames: ImageArray) -> tuple[Cut, ...]:
     return find_cuts(ArrayFrames(frames), CONFIG)
 
@@ -88,10 +94,7 @@ def test_a_whip_pan_is_no_cut(step: int) -> None:
 
 @pytest.mark.parametrize("length", [8, 14])
 def test_a_dissolve_is_one_cut_and_its_frames_are_of_neither_shot(length: int) -> None:
-    one, other = shot(0, 40).astype(float), shot(1, 40).astype(float)
-    alpha = (np.arange(1, length + 1) / (length + 1))[:, None, None]
-    blend = (1 - alpha) * one[40 - length :] + alpha * other[:length]
-    found = cuts(np.concatenate((one[: 40 - length], blend, other[length:])).astype(np.uint8))
+    found = cuts(dissolved(shot(0, 40), shot(1, 40), length))
     assert len(found) == 1
     assert abs(found[0].stop - (40 - length)) <= 2
     assert abs(found[0].start - 40) <= 2
@@ -107,12 +110,6 @@ def test_black_frames_within_a_shot_are_no_cut() -> None:
     clip = shot(0, 40)
     clip[18:24] = 0
     assert cuts(clip) == ()
-
-
-def dissolved(one: ImageArray, other: ImageArray, length: int) -> ImageArray:
-    stop, alpha = len(one) - length, np.arange(1, length + 1)[:, None, None] / (length + 1)
-    between = (1 - alpha) * one[stop:] + alpha * other[:length]
-    return np.concatenate((one[:stop], between.astype(np.uint8), other[length:]))
 
 
 def test_corners_outlive_what_is_no_dissolve() -> None:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.cues.depth_settings import OPEN_FOCAL_SIGMA
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.selection import picture_cells
@@ -38,8 +39,6 @@ _SHARED = 2.0
 """On 34 random synthetic clips half of the errors of f were above 1.8 standard deviations, and not above 0.7."""
 _CELLS = 8
 """Parts of the image along its longer side whose tracks may err alike."""
-NARROW = 0.03
-"""Up to this standard deviation of log f, E(f) is as good as quadratic."""
 _FIRST_STEP = 0.03
 """Step of log f with which the search for an end of the interval begins, at least ..."""
 _WIDEN = 1.6
@@ -65,7 +64,7 @@ class FocalInterval:
     @property
     def is_wide(self) -> bool:
         """Whether the tracks tell the focal length so poorly that what cameras usually have says something, too."""
-        return not self.deviation <= NARROW
+        return not self.deviation <= OPEN_FOCAL_SIGMA
 
     def likely(self, focal: float, usual: float, sigma: float) -> float:
         """Return the most likely focal length, px, of a focal length that was found and one that cameras usually have.
@@ -116,7 +115,7 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
         noise = max(noise, (clustered_deviation(scene, stage, state) / independent) ** 2)
     noise *= _SHARED**2
     deviation = independent * np.sqrt(noise)
-    if deviation <= NARROW:
+    if deviation <= OPEN_FOCAL_SIGMA:  # as far as that E(f) is as good as quadratic
         ends = focal * np.exp(np.array([-1.96, 1.96]) * deviation)
         return FocalInterval(float(ends[0]), float(ends[1]), deviation=deviation)
     profile = _Profile(scene, noise)

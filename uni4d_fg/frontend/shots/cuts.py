@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -178,11 +179,14 @@ class _Search:
         shares, _, _ = self.blend(a, b)
         return bool(shares[:2].max() < 0.25 and shares[2:].min() > 0.75)
 
+    @cached_property
+    def spans(self) -> list[Span]:
+        """What became of corners across the video, between its gaps; which are known afterwards."""
+        return list(spans(self.frames, self.steps(), self.config))
+
     def is_outlived(self, cut: Cut) -> bool:
         """Tell whether more corners outlive the shortest spans across a dissolve than do if it is one."""
-        across = [
-            s for s in spans(self.frames, self.steps(), self.config) if s.first < cut.stop and s.last >= cut.start
-        ]
+        across = [s for s in self.spans if s.first < cut.stop and s.last >= cut.start]
         shortest = min((s.last - s.first for s in across), default=0)
         return bool(across) and all(s.alive > 2.0 * self.surviving(s) for s in across if s.last - s.first == shortest)
 
@@ -195,8 +199,7 @@ class _Search:
 
     def dissolves(self) -> list[Cut]:
         found: list[_Dissolve] = []
-        followed = list(spans(self.frames, self.steps(), self.config))
-        for span in [*followed, *self.gaps]:
+        for span in [*self.spans, *self.gaps]:
             limit = self.surviving(span)
             candidate = self.dissolve(span) if span.alive <= 2.0 * limit else None
             if candidate is not None and (span.alive <= limit or candidate.explained >= self.config.sure_blend):

@@ -270,9 +270,8 @@ def _covariances(
     considered = None
     if focal_sigma:
         considered = considered_focal_lengths(state[INTRINSICS][0], focal_sigma, config.aspect_prior_sigma)
-        pixel = [] if config.free_principal_point else [2, 3]
-        problem = replace(stage.problem, free={**stage.problem.free, **all_free(state, INTRINSICS)})
-        stage = replace(stage, problem=problem.fix(INTRINSICS, entries=pixel))
+        free = {**stage.problem.free, **all_free(state, INTRINSICS)}
+        stage = replace(stage, problem=replace(stage.problem, free=free))
     joined, clusters = joined_by(run, stage, state), track_cells(observations, state[INTRINSICS][0], config)
     marginals = static_marginals(joined.stage, joined.state, clusters, considered=considered)
     if marginals is None and joined.added:  # added variables that nothing determines say nothing of the cameras

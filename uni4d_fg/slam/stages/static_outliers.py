@@ -92,8 +92,8 @@ def _astray(
     if config.trim_sigmas is None:
         return np.zeros(len(count), np.bool_)
     everywhere = max(robust_sigma(residual), config.min_reprojection_sigma_px)
-    groups = rows_by_group(observations.frame, num_frames)
-    noise = np.array([max(robust_sigma(residual[rows]), everywhere) if len(rows) else everywhere for rows in groups])
+    frames = rows_by_group(observations.frame, num_frames)
+    noise = np.fmax([robust_sigma(residual[rows]) for rows in frames], everywhere)
     beyond = np.linalg.norm(residual, axis=1) > config.trim_sigmas * noise[observations.frame]
     return np.asarray(np.bincount(row, beyond) > 0.5 * count)
 
