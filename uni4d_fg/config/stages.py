@@ -63,6 +63,12 @@ class CameraInitConfig(Section):
     aspect_prior_sigma: float = setting(
         1e-3, "Standard deviation of log(fx / fy) about the given intrinsics' own: pixels keep their shape.", gt=0
     )
+    max_depth_spread: float | None = setting(
+        0.04,
+        "Where the depths of static points depart from frame to frame by more (a standard deviation of log depth), the "
+        "cameras are found from the tracks alone, by structure from motion; null: always with the depth cue.",
+        gt=0,
+    )
     reprojection_sigma_px: float = setting(
         1.0, "Standard deviation of a depth reprojection residual, px.", gt=0, basic=True
     )

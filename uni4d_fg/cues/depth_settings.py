@@ -44,13 +44,27 @@ def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed:
         sequence: Its fields ``depth_parallax`` and ``focal_sigma`` say where depth and intrinsics are from.
         depth_is_needed: Whether what the run does relies on a depth prior for the scale of the world.
     """
-    update: dict[str, object] = {}
-    stage: dict[str, object] = {}
     if sequence.focal_sigma is not None:
-        update["input"] = config.input.model_copy(update={"intrinsics": "fixed"})
-        if config.bundle_adjustment.trim_sigmas is None:
-            stage["trim_sigmas"] = config.geometric_depth.stage_trim_sigmas
+        config = settings_of_motion(config, depth_prior=config.bundle_adjustment.depth_prior)
     if sequence.depth_parallax and not (config.geometric_depth.depth_prior or depth_is_needed):
-        stage["depth_prior"] = False
-    update["bundle_adjustment"] = config.bundle_adjustment.model_copy(update=stage)
-    return config.model_copy(update=update)
+        stage = config.bundle_adjustment.model_copy(update={"depth_prior": False})
+        config = config.model_copy(update={"bundle_adjustment": stage})
+    if sequence.depth_parallax is not None or depth_is_needed:
+        stage_1 = config.camera_init.model_copy(update={"max_depth_spread": None})
+        config = config.model_copy(update={"camera_init": stage_1})
+    return config
+
+
+def settings_of_motion(config: Config, *, depth_prior: bool) -> Config:
+    """Return the configuration of stage 2 for cameras that structure from motion found.
+
+    Their intrinsics are held, and tracks that depart from most others are left out.
+    """
+    stage = config.bundle_adjustment
+    trim = config.geometric_depth.stage_trim_sigmas if stage.trim_sigmas is None else stage.trim_sigmas
+    return config.model_copy(
+        update={
+            "input": config.input.model_copy(update={"intrinsics": "fixed"}),
+            "bundle_adjustment": stage.model_copy(update={"trim_sigmas": trim, "depth_prior": depth_prior}),
+        }
+    )

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -24,7 +24,7 @@ from uni4d_fg.cues.depth_settings import settings_behind_lens
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
 from uni4d_fg.cues.plan import CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
-from uni4d_fg.errors import Cancelled, ConfigError, InputError
+from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.bars import bars_note, without_bars
@@ -37,7 +37,6 @@ from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.optim.added_factors import FactorSource, fingerprints, with_additions
 from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.problem_io import save_stage_graph
 from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.optim.stage_graph import RecordingRunner
@@ -48,7 +47,8 @@ from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.control import BegunControl, static_control
 from uni4d_fg.pipeline.fingerprint import sequence_digest, stage_key
 from uni4d_fg.pipeline.fuse import fuse_depth
-from uni4d_fg.pipeline.graphs import KEPT, GraphValues, kinds_of, remove_graphs
+from uni4d_fg.pipeline.graphs import KEPT, GraphValues
+from uni4d_fg.pipeline.in_progress import MUCH, RunInProgress
 from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
@@ -58,8 +58,9 @@ from uni4d_fg.pipeline.measurements import MeasurementFiles, Measurements, read_
 from uni4d_fg.pipeline.repeats import Repeats
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
-from uni4d_fg.pipeline.summary import RunSummary, peak_memory_mb
-from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, WindowWorkers, window_workers
+from uni4d_fg.pipeline.summary import RunSummary
+from uni4d_fg.pipeline.tracks_alone import without_poor_depth
+from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.pipeline.written_beside import WrittenBeside
@@ -76,82 +77,6 @@ from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.windows.plan import Window, windows_of
 
 ValueT = TypeVar("ValueT")
-
-_MUCH = 256 << 20
-"""Bytes; more free memory than this is handed back before a step: the next one has arrays of other sizes."""
-
-
-@dataclass
-class _Run:
-    """What the steps of one run share."""
-
-    sequence: Sequence
-    config: Config
-    folder: RunFolder
-    store: StageStore
-    resume: bool
-    reporter: Reporter
-    should_stop: Callable[[], bool]
-    summary: RunSummary
-    recorder: RecordingRunner
-    written: WrittenBeside
-    """What writes the files of finished steps."""
-    sources: tuple[FactorSource, ...]
-    """What is added to the stages."""
-    imu: ImuSamples | None = None
-    options: WorkerOptions | None = None
-    """How windows are solved; None: here, with all threads."""
-    workers: WindowWorkers | None = None
-    """Where they are, if not here."""
-
-    def step(self, name: str, key: str, compute: Callable[[Hooks], StageRecord], total: int | None = None) -> Arrays:
-        """Return a stage's arrays: stored ones of the same key when resuming, else computed and stored.
-
-        ``total`` is the work that the stage reports itself, in units of its own.
-        """
-        began = time.perf_counter()
-        record = self.store.load(name, key) if self.resume else None
-        resumed = record is not None
-        if record is None:
-            self._check_cancelled()
-            # A step may write files besides its record: an old record must not vouch for half-new ones.
-            self.store.discard(name)
-            remove_graphs(self.folder, name, done=self.summary.stages)
-            self.recorder.solved.clear()
-            self.reporter.begin(name.replace("_", " "), total)
-            counter = iter(range(1, 1 << 30))
-            hooks = Hooks(
-                on_iteration=lambda solve, _, energy: self.reporter.advance(
-                    next(counter), f"{solve}: energy {energy:.5g}"
-                ),
-                should_stop=self.should_stop,
-            )
-            return_free_memory(_MUCH)
-            record = compute(hooks)
-            for kind in kinds_of(name):
-                if kind in self.recorder.solved:
-                    self.written.put(partial(save_stage_graph, self.folder.graph(kind), self.recorder.solved[kind]))
-            self.recorder.solved.clear()
-            self.written.put(partial(self.store.save, name, key, record))
-            self.reporter.end()
-        self._note(name, record.summary, time.perf_counter() - began, resumed)
-        return record.arrays
-
-    def track_progress(self, done: int, total: int) -> None:
-        """Report the tracker's steps."""
-        self.reporter.advance(done, f"step {done} of {total}")
-
-    def _note(self, name: str, summary: dict[str, Any], seconds: float, resumed: bool) -> None:
-        warnings = summary.get("warnings", [])
-        rest = {field: value for field, value in summary.items() if field != "warnings"}
-        self.summary.stages[name] = {
-            "seconds": seconds, "peak_memory_mb": peak_memory_mb(), "resumed": resumed, **rest
-        }  # fmt: skip
-        self.summary.warnings += warnings
-
-    def _check_cancelled(self) -> None:
-        if self.should_stop():
-            raise Cancelled("stopped; finished stages are kept, --resume continues from them")
 
 
 def reconstruct(
@@ -251,7 +176,7 @@ def _reconstruct(
     if windows and not sources:
         on = window_workers(workers, windows, sequence.image_size, run_dir / "stages", config, recorder, should_stop)
     with WrittenBeside() as written, on or nullcontext():
-        run = _Run(
+        run = RunInProgress(
             sequence, config, folder, StageStore(run_dir / "stages"), resume,
             reporter, should_stop, summary, recorder, written, sources, imu, workers, on,
         )  # fmt: skip
@@ -260,7 +185,7 @@ def _reconstruct(
         return _solve(run, windows, measured, run_stage)
 
 
-def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: StageRunner) -> RunSummary:
+def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, run_stage: StageRunner) -> RunSummary:
     """Do all steps of a run that has been prepared."""
     sequence, config, folder, summary = run.sequence, run.config, run.folder, run.summary
     if config.output.pictures:
@@ -297,7 +222,7 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
     )
     solved, solved_tracks, config = camera.apply(solved, solved_tracks, config)
     config = settings_behind_lens(config, sequence, depth_is_needed=not alone)
-    key = stage_key(key, sequence.focal_sigma)
+    key = stage_key(key, sequence.focal_sigma, config.camera_init)
     key, scene, motion = _stages(run, key, solved, solved_tracks, config, windows, run_stage, fragments, loops, static)
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)
@@ -309,7 +234,7 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
     unit = "m" if summary.cues.get("metric", True) else "scale unknown"
-    return_free_memory(_MUCH)
+    return_free_memory(MUCH)
     with ThreadPoolExecutor(1) as beside:
         # Clouds mostly wait for the disk.
         made = beside.submit(GraphValues.of, folder)
@@ -317,12 +242,12 @@ def _solve(run: _Run, windows: list[Window], measured: Measurements, run_stage: 
     graphs = made.result()
     graphs.write(folder)
     run.reporter.end()
-    run._note("output", {"graphs": graphs.sizes}, time.perf_counter() - began, False)
+    run.note("output", {"graphs": graphs.sizes}, time.perf_counter() - began, False)
     atomic_write_json(folder.summary, summary.to_dict())
     return summary
 
 
-def _camera(run: _Run, key: str, sequence: Sequence, labelled: LabelledTracks) -> tuple[str, CameraModel]:
+def _camera(run: RunInProgress, key: str, sequence: Sequence, labelled: LabelledTracks) -> tuple[str, CameraModel]:
     """Find the lens, where it is not given or ruled out; return the key so far and the camera."""
     config = run.config
     if not is_sought(sequence, config):
@@ -335,7 +260,7 @@ def _camera(run: _Run, key: str, sequence: Sequence, labelled: LabelledTracks) -
 
 
 def _stages(
-    run: _Run,
+    run: RunInProgress,
     key: str,
     sequence: Sequence,
     labelled: LabelledTracks,
@@ -356,7 +281,7 @@ def _stages(
     if windows:
         if config.joint.enabled:
             run.summary.warnings.append(NOT_IN_WINDOWS)
-        _forget(run, "joint")
+        run.forget("joint")
         key = stage_key(key, config.bundle_adjustment, config.windows, *fingerprints(sources))
         before = key
         if run.options is not None and run.sources:
@@ -378,6 +303,7 @@ def _stages(
                 static.begin(scene)  # while they solve windows this process is idle
             return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
     cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
+    sequence, config, cameras, key = without_poor_depth(run, key, sequence, labelled, cameras, config)
     inertial = [] if run.imu is None else [config.imu, run.imu.digest()]
     key = stage_key(key, config.bundle_adjustment, *inertial, *fingerprints(sources))
     scene = run.step(
@@ -395,17 +321,11 @@ def _stages(
         lambda hooks: nonrigid_step(labelled, scene, config, hooks, run_stage, sequence.timestamps),
     )
     if not config.joint.enabled:
-        _forget(run, "joint")
+        run.forget("joint")
         return key, scene, motion
     key = stage_key(key, config.joint)
     both = run.step("joint", key, lambda hooks: joint_step(sequence, labelled, scene, motion, config, hooks, run_stage))
     return key, both, both
-
-
-def _forget(run: _Run, name: str) -> None:
-    """Remove what an earlier run left of a step that this one does not have."""
-    run.store.discard(name)
-    remove_graphs(run.folder, name)
 
 
 def _searched(config: Config) -> list[RigidObjectsConfig]:
@@ -413,7 +333,7 @@ def _searched(config: Config) -> list[RigidObjectsConfig]:
     return [config.rigid_objects] if config.rigid_objects.enabled else []
 
 
-def _repair_masks(run: _Run, key: str) -> str:
+def _repair_masks(run: RunInProgress, key: str) -> str:
     """Give the sequence masks where some were missing, and return the key, with what was changed."""
     repaired = repair_masks(run.sequence.images, run.sequence.masks, run.sequence.image_size)
     if repaired is None:
@@ -422,7 +342,7 @@ def _repair_masks(run: _Run, key: str) -> str:
     return stage_key(key, repaired.fingerprint())
 
 
-def _labels(run: _Run, key: str, images: bytes) -> tuple[str, LabelledTracks]:
+def _labels(run: RunInProgress, key: str, images: bytes) -> tuple[str, LabelledTracks]:
     """Track and label; the labelled tracks are stored in ``labels.npz``, their key beside the stages.
 
     ``images`` is the hash of the images.
@@ -462,8 +382,8 @@ def _labels(run: _Run, key: str, images: bytes) -> tuple[str, LabelledTracks]:
 
 
 def _fuse(
-    run: _Run, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays, zoom: FloatArray | None, lens: Lens,
-    static: BegunControl,
+    run: RunInProgress, key: str, labelled: LabelledTracks, scene: Arrays, motion: Arrays, zoom: FloatArray | None,
+    lens: Lens, static: BegunControl,
 ) -> None:  # fmt: skip
     expected = (run.sequence.num_frames, *run.sequence.image_size)
     stored = run.folder.depth

@@ -31,6 +31,7 @@ from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.pipeline.warnings import scene_warnings, unmasked_motion_warnings
 from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
+from uni4d_fg.slam.stages.depth_spread import depth_spread
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy, energy_of
 from uni4d_fg.slam.stages.local_scale import predict_log_scale
 from uni4d_fg.slam.stages.merging import FindFragments
@@ -88,7 +89,11 @@ def camera_init_step(
             f"constant velocity: {_listed(result.bridged_frames)}"
         ]
     cameras = result.cameras
-    return StageRecord({"world_T_cam": cameras.world_T_cam, "intrinsics": cameras.intrinsics}, summary)
+    arrays = {"world_T_cam": cameras.world_T_cam, "intrinsics": cameras.intrinsics}
+    if config.camera_init.max_depth_spread is not None and energy_of(config).is_likelihood:
+        static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
+        arrays["depth_spread"] = np.array(depth_spread(static, cameras))
+    return StageRecord(arrays, summary)
 
 
 def bundle_adjustment_step(

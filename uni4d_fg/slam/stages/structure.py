@@ -111,11 +111,11 @@ def refine_structure(
 def relift_structure(state: State, observations: Observations) -> State:
     """Put every landmark at the mean lift of its depth cues, where it has any."""
     landmarks = state[LANDMARK]
-    lifted = _mean_lift(observations, Cameras.of(state))
+    lifted = mean_lift(observations, Cameras.of(state))
     return state.replace({LANDMARK: np.where(np.isfinite(lifted), lifted, landmarks)})
 
 
-def _mean_lift(observations: Observations, cameras: Cameras) -> FloatArray:
+def mean_lift(observations: Observations, cameras: Cameras) -> FloatArray:
     """Return where the depth cues of every track lift it to, (M, 3), as a mean by weight; NaN without any."""
     tracks, row = observations.rows()
     return mean_per_row(lift(observations, cameras), observations.weight, row, len(tracks))
@@ -129,7 +129,7 @@ def liftable(
     observations = observations.with_min_observations(min(config.min_observations, len(cameras.world_T_cam)))
     tracks, row = observations.rows()
     dropped["track with too few observations"] = before - len(tracks)
-    landmarks = _mean_lift(observations, cameras)
+    landmarks = mean_lift(observations, cameras)
     known = np.asarray(np.isfinite(landmarks).all(axis=1))
     dropped["track without depth"] = int((~known).sum())
     return observations.select(known[row]), landmarks[known]
@@ -167,7 +167,7 @@ def further_landmarks(
     points, kept, solves = [], [], []
     for part in range(parts):
         some = observations.select(row % parts == part)  # of every frame alike, for weights by frame
-        landmarks = _mean_lift(some, Cameras.of(state))
+        landmarks = mean_lift(some, Cameras.of(state))
         own = State({**state.arrays, LANDMARK: landmarks}, {**state.index, LANDMARK: some.rows()[0]})
         for solver in (early(config.structure_solver), config.structure_solver):
             problem = structure_problem(own, some, noise, config).fix(LOG_SCALE)

@@ -1,0 +1,154 @@
+"""Cameras from the tracks alone, where the depth cue is too poor to say anything of them.
+
+A depth cue helps the cameras where it is right: it holds the scale of the path, and tells the focal length where
+parallax does not. One that errs by several percent, alike over large parts of the image and over many frames, does the
+reverse. Tracks have a hundred times its precision, but it bends what they leave open, the focal length above all, and
+its errors are no noise that many observations average out. The cameras are then found by structure from motion, and
+stage 2 keeps its focal lengths, as for a video without depth; the cue is left with the scale of the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, rows_by_group
+from uni4d_fg.config.models import Config
+from uni4d_fg.cues.depth_settings import settings_of_motion
+from uni4d_fg.errors import Cancelled, SolverError
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
+from uni4d_fg.geometry.camera import NEAR_PLANE, seen_from
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.pipeline.fingerprint import stage_key
+from uni4d_fg.pipeline.in_progress import RunInProgress
+from uni4d_fg.pipeline.steps import STOPPED, Arrays
+from uni4d_fg.pipeline.store import StageRecord
+from uni4d_fg.progress import Reporter
+from uni4d_fg.slam.stages.observations import Observations, observations_of
+
+_STEP = "structure_from_motion"
+
+
+def without_poor_depth(
+    run: RunInProgress, key: str, sequence: Sequence, labelled: LabelledTracks, cameras: Arrays, config: Config
+) -> tuple[Sequence, Config, Arrays, str]:
+    """Find the cameras from the tracks alone where the depth cue is poor.
+
+    Args:
+        run: The run.
+        key: Of stage 1.
+        sequence: What stages solve.
+        labelled: Its tracks.
+        cameras: Record of stage 1.
+        config: What stages are solved with.
+
+    Returns:
+        What stage 2 is solved with: sequence, configuration, starting cameras and the key of those.
+
+    Raises:
+        Cancelled: If the user interrupts.
+    """
+    if not is_poor(cameras, config):
+        run.forget(_STEP)
+        return sequence, config, cameras, key
+    key = stage_key(key, config.geometric_depth, config.bundle_adjustment)
+    found = run.step(_STEP, key, lambda hooks: structure_step(sequence, labelled, cameras, config, hooks, run.reporter))
+    return *with_known_cameras(sequence, found, config), found, key
+
+
+def is_poor(cameras: Arrays, config: Config) -> bool:
+    """Tell from the record of stage 1 whether the cameras are to be found without the depth cue."""
+    limit = config.camera_init.max_depth_spread
+    return limit is not None and "depth_spread" in cameras and bool(cameras["depth_spread"] > limit)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """The steps of structure from motion as progress of the step of the run that they are part of."""
+
+    reporter: Reporter
+
+    def begin(self, task: str, total: int | None) -> None:
+        self.reporter.advance(0, task)
+
+    def advance(self, done: int, text: str = "") -> None:
+        self.reporter.advance(done, text)
+
+    def end(self, text: str = "") -> None:
+        pass
+
+
+def structure_step(
+    sequence: Sequence, labelled: LabelledTracks, cameras: Arrays, config: Config, hooks: Hooks, reporter: Reporter
+) -> StageRecord:
+    """Find cameras by structure from motion; those of stage 1 are kept where the motion shows none.
+
+    Args:
+        sequence: Image size and intrinsics.
+        labelled: All tracks; the static ones serve.
+        cameras: Record of stage 1.
+        config: Sections ``geometric_depth``, ``bundle_adjustment`` and ``input``.
+        hooks: Cancellation.
+        reporter: Progress.
+
+    Raises:
+        Cancelled: If the user interrupts.
+    """
+    # Hundreds of milliseconds to load, and most runs need nothing of it.
+    from uni4d_fg.cues.structure.motion import structure_from_motion
+
+    spread = float(cameras["depth_spread"])
+    said = f"depths of static points depart by {100 * spread:.0f} % from frame to frame"
+    kept = {name: cameras[name] for name in ("world_T_cam", "intrinsics")}
+    static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(2)
+    try:
+        found = structure_from_motion(
+            replace(static, weight=np.ones(len(static)), depth=np.full(len(static), np.nan)),
+            labelled.tracks.num_frames, sequence.image_size, sequence.intrinsics, config, _Steps(reporter),
+            hooks.should_stop or (lambda: False),
+        )  # fmt: skip
+    except Cancelled as error:
+        raise Cancelled(STOPPED) from error
+    except SolverError as error:
+        return StageRecord(kept, {"facts": [f"{said}; no cameras were found without them: {error}"]})
+    if found is None or not found.registered.all():
+        why = "the camera hardly moves" if found is None else "some frames see too few points"
+        return StageRecord(kept, {"facts": [f"{said}; cameras are found with them all the same, as {why}"]})
+    poses = np.linalg.inv(found.world_T_cam[0]) @ found.world_T_cam
+    row = np.full(len(labelled.label), -1)
+    row[found.track] = np.arange(len(found.track))
+    some = static.select(row[static.track] >= 0)
+    z = seen_from(found.world_T_cam, some.frame, found.points.position[row[some.track]])[:, 2]
+    poses[:, :3, 3] *= _scale(some, z, len(poses))
+    summary: dict[str, Any] = {
+        "facts": [
+            f"{said}, so the tracks alone find the cameras: fx {found.intrinsics[0]:.1f} px, known to "
+            f"{100 * found.focal_sigma:.1f} %"
+        ],
+        "depth_spread": spread,
+        "focal_sigma": found.focal_sigma,
+        "unexplained": found.unexplained,
+    }
+    arrays = {"world_T_cam": poses, "intrinsics": found.intrinsics, "focal_sigma": np.array(found.focal_sigma)}
+    return StageRecord(arrays, summary)
+
+
+def _scale(observations: Observations, z: FloatArray, num_frames: int) -> float:
+    """Return the factor on depths ``z`` (N,) with which the median frame agrees with its cue."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.log(observations.depth / np.where(z > NEAR_PLANE, z, np.nan))
+    known = np.flatnonzero(np.isfinite(ratio))
+    frames = rows_by_group(observations.frame[known], num_frames)
+    medians = [np.median(ratio[known[rows]]) for rows in frames if len(rows)]
+    return float(np.exp(np.median(medians))) if medians else 1.0
+
+
+def with_known_cameras(sequence: Sequence, cameras: Arrays, config: Config) -> tuple[Sequence, Config]:
+    """Return what stage 2 solves from the record of :func:`structure_step`: focal lengths and the use of depth."""
+    if "focal_sigma" not in cameras:
+        return sequence, config
+    sequence = replace(sequence, focal_sigma=float(cameras["focal_sigma"]))
+    return sequence, settings_of_motion(config, depth_prior=False)
