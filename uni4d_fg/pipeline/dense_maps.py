@@ -20,6 +20,7 @@ from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
 from uni4d_fg.results.fusion.lifting import lifted
 from uni4d_fg.results.fusion.mask_band import STILL, looks_moving, stands_still
+from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_preferred, tells_bleeding
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import (
@@ -44,14 +45,6 @@ _CARRIED_REACH, _CARRIED_FROM = 6, 2
 _BESIDE = tuple(range(1, _CARRIED_REACH + 1))
 _AVERAGED_SIGMA = (0.005, 0.06)
 """Bounds of the standard deviation from which it is told which frames agree."""
-_SHARP_PX = 4.0
-"""Matching blurs edges by this itself: a cue that is found to bleed no farther has the detail of edges, working px."""
-_BETTER = 1.0
-"""Matched depth is used if its error at landmarks is below this part of the corrected cue's ..."""
-_NOT_WORSE = 1.5
-"""... and below this one if the cue bleeds: landmarks do not lie on edges."""
-_FAR_WORSE = 4.0
-"""If depth that was matched without comparing frames is above this in one frame, nothing more is tried."""
 _TRIED_FRAMES = 3
 """Frames that are matched first: where landmarks prefer the cue in all of them, no others are matched."""
 _SURE = 0.8
@@ -204,7 +197,7 @@ class DenseMaps:
         if not self.broken:
             middle = sound[len(sound) // 2]
             errors = self._judged(middle, self.multiview.alone(middle)).errors
-            if errors.telling and errors.matching > _FAR_WORSE:
+            if adds_nothing(errors):
                 self.unmatched = _ADDS_NOTHING
                 return
         tried, bled = list[HeldOut](), list[float]()
@@ -212,13 +205,11 @@ class DenseMaps:
             measured = self.multiview.at(sound[at])
             judged = self._judged(sound[at], measured)
             tried.append(judged.errors)
-            if measured is not None and self._counts(judged.errors, _NOT_WORSE, bleeds=True):
-                radius = self._bleeding(sound[at], judged, measured)
-                bled += [radius] if np.isfinite(radius) else []
-        radius = float(np.median(bled)) if bled else 0.0
-        self.bleeding_px = radius if radius > _SHARP_PX else 0.0
+            if measured is not None and tells_bleeding(judged.errors):
+                bled.append(self._bleeding(sound[at], judged, measured))
+        self.bleeding_px = bleeding_of(bled, self._noise)
         # One choice for the whole video: between frames that are matched and others that are not, surfaces would jump.
-        preferred = [self._counts_here(errors) for errors in tried]
+        preferred = [self._prefers(errors) for errors in tried]
         self.prefers_matching = 2 * sum(preferred) > len(preferred)
         if not (self.prefers_matching or self.broken):
             self.unmatched = _ADDS_NOTHING
@@ -379,7 +370,7 @@ class DenseMaps:
     def _by_nearest_points(self, frame: int, given: Float32Array, mask: Int32Array) -> Float32Array:
         return densify_frame(
             given, mask, self.intrinsics[frame], self.control[frame],
-            float(self.scene["log_scale"][frame]), float(self.scene["noise"][1]), self.config,
+            float(self.scene["log_scale"][frame]), self._noise, self.config,
         )  # fmt: skip
 
     def _static(self, frame: int) -> _Made:
@@ -394,7 +385,7 @@ class DenseMaps:
         judged = self._judged(frame, measured)
         # Where landmarks say that the corrected cue is the better one, matches would only add their noise. What is
         # carried into a broken frame was corrected by them before: they do not speak against matching there.
-        if not (self.prefers_matching or (frame in self.broken and self._counts_here(judged.errors))):
+        if not (self.prefers_matching or (frame in self.broken and self._prefers(judged.errors))):
             measured = None
         if measured is not None:
             self.matched.add(frame)
@@ -451,15 +442,14 @@ class DenseMaps:
         sure = judged.static & (measured.confidence > _SURE)
         return bleeding_radius(corrected.affine(judged.cue), measured.log_depth, sure)
 
-    @staticmethod
-    def _counts(errors: HeldOut, limit: float, *, bleeds: bool) -> bool:
-        """Tell whether matched depth is the better one in a frame."""
-        return errors.matching < limit or (bleeds and not errors.telling)
-
-    def _counts_here(self, errors: HeldOut) -> bool:
+    def _prefers(self, errors: HeldOut) -> bool:
         """Tell whether matched depth is the better one, as far as a frame says; once it is known whether cues bleed."""
-        bleeds = self.bleeding_px > 0
-        return self._counts(errors, _NOT_WORSE if bleeds else _BETTER, bleeds=bleeds)
+        return is_preferred(errors, self.bleeding_px, self._noise)
+
+    @property
+    def _noise(self) -> float:
+        """Of the cue at landmarks, a standard deviation of the log depth."""
+        return float(self.scene["noise"][1])
 
     def _landmark_cues(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where a frame sees landmarks, (N, 2) working px, log depth over the cue, and the log cue (N,)."""

@@ -8,6 +8,12 @@ from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.cue_error import fit_affine
 from uni4d_fg.results.fusion.densify import ControlPoints
 
+_LEAST = 7e-4
+"""Error of the log depth from which one cue is compared with others."""
+_QUANTILES = (0.5, 0.9)
+"""Of the errors at a frame's landmarks. Where most are on one wall the median sees no other depth, and finds a constant
+cue as good as any; what stands before the wall tells."""
+
 
 def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> list[int]:
     """Return the frames whose cue, but for scale and shift of its disparity, is far worse than that of the others.
@@ -20,18 +26,20 @@ def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> 
         control: Landmarks of all frames.
         config: Thresholds.
     """
-    left = np.full(len(control), np.nan)
-    constant = np.full(len(control), np.nan)
+    left = np.full((len(_QUANTILES), len(control)), np.nan)
+    constant = np.full((len(_QUANTILES), len(control)), np.nan)
     for frame, points in enumerate(control):
         static = (points.instance == 0) & np.isfinite(points.log_scale) & (points.cue > 0)
         if np.count_nonzero(static) < config.min_control_points:
             continue
-        log_z = points.log_scale[static] + np.log(points.cue[static])
-        left[frame] = fit_affine(points.cue[static], log_z, np.ones(len(log_z)))[2]
-        constant[frame] = 1.4826 * np.median(np.abs(log_z - np.median(log_z)))
-    if np.isfinite(left).sum() < config.min_broken_frames:
+        cue = points.cue[static]
+        log_z = points.log_scale[static] + np.log(cue)
+        a, b, _ = fit_affine(cue, log_z, np.ones(len(log_z)))
+        left[:, frame] = np.quantile(np.abs(log_z + np.log(a / cue + b)), _QUANTILES)
+        constant[:, frame] = np.quantile(np.abs(log_z - np.median(log_z)), _QUANTILES)
+    if np.isfinite(left[0]).sum() < config.min_broken_frames:
         return []
-    usual = max(float(np.nanmedian(left)), 1e-3)
+    usual = np.maximum(np.nanmedian(left, axis=1, keepdims=True), _LEAST)
     with np.errstate(invalid="ignore"):
         broken = (left > config.broken_ratio * usual) & (left > config.broken_share * constant)
-    return np.flatnonzero(broken).tolist()
+    return np.flatnonzero(broken.any(axis=0)).tolist()

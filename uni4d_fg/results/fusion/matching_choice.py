@@ -1,0 +1,64 @@
+"""Whether a video's depth is matched over several views or the corrected cue: what landmarks say of both, and edges."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.results.fusion.static_depth import HeldOut
+
+_SHARP_PX = 4.0
+"""Matching blurs edges by this itself: a cue that is found to bleed no farther has the detail of edges, working px."""
+_BETTER = 1.0
+"""Matched depth is used if its error at landmarks is below this part of the corrected cue's ..."""
+_NOT_WORSE = 1.5
+"""... and below this one if the cue bleeds: landmarks do not lie on edges."""
+_FAR_WORSE = 4.0
+"""If depth that was matched without comparing frames is above this in one frame, nothing more is tried."""
+_POOR, _POOR_BLEEDS_PX, _NOT_WORSE_THAN_POOR = 0.04, 6.0, 3.0
+"""A cue whose noise, a standard deviation of the log, is above the first is a network's: it bleeds across edges by the
+second, working px, at least, whether a few frames show it or not, and only matched depth has its edges right. Landmarks
+prefer it all the same, as it was corrected by others beside them: matched depth is used below the third."""
+
+
+def adds_nothing(errors: HeldOut) -> bool:
+    """Tell from a frame that was matched without comparing frames whether nothing more need be tried."""
+    return errors.telling and errors.matching > _FAR_WORSE
+
+
+def tells_bleeding(errors: HeldOut) -> bool:
+    """Tell whether matched depth is good enough to see by it how far the cue bleeds.
+
+    A cue that was made from landmarks is not judged by them.
+    """
+    return _counts(errors, _NOT_WORSE, bleeds=True)
+
+
+def bleeding_of(radii: list[float], noise: float) -> float:
+    """Return how far a cue bleeds, working px; 0 for one that has the detail of edges.
+
+    Args:
+        radii: Of the frames that tell; NaN for those that do not.
+        noise: Of the cue at landmarks, a standard deviation of the log depth.
+    """
+    known = [radius for radius in radii if np.isfinite(radius)]
+    radius = float(np.median(known)) if known else 0.0
+    if noise > _POOR:
+        radius = max(radius, _POOR_BLEEDS_PX)
+    return radius if radius > _SHARP_PX else 0.0
+
+
+def is_preferred(errors: HeldOut, bleeding_px: float, noise: float) -> bool:
+    """Tell whether matched depth is the better one, as far as a frame says.
+
+    Args:
+        errors: Of both in the frame.
+        bleeding_px: How far the cue bleeds, see :func:`bleeding_of`.
+        noise: Of the cue at landmarks, a standard deviation of the log depth.
+    """
+    if bleeding_px == 0:
+        return _counts(errors, _BETTER, bleeds=False)
+    return _counts(errors, _NOT_WORSE_THAN_POOR if noise > _POOR else _NOT_WORSE, bleeds=True)
+
+
+def _counts(errors: HeldOut, limit: float, *, bleeds: bool) -> bool:
+    return errors.matching < limit or (bleeds and not errors.telling)
