@@ -5,9 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from mask_overlap import overlap
 
 from uni4d_fg.cues import mask_flicker
-from uni4d_fg.cues.mask_distance import PackedDistance, overlap, signed_distance
+from uni4d_fg.cues.mask_distance import PackedDistance, signed_distance
 from uni4d_fg.cues.mask_flicker import may_flicker
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks
 from uni4d_fg.frontend.sequence.model import ArrayFrames
@@ -59,6 +60,23 @@ def test_flickering_masks_are_averaged_to_the_truth(rng: np.random.Generator) ->
     assert min(after[2:-2]) > 0.8
 
 
+def test_masks_that_are_too_large_or_too_small_for_some_frames_are_averaged(rng: np.random.Generator) -> None:
+    """In more than half of the frames those beside are alike, and where they change one lies deep within the other."""
+    images, truth = clip(rng, [1.0] * FRAMES)
+    large = np.repeat([True, False, True, False], FRAMES // 4)
+    given = truth.copy()
+    for frame in range(FRAMES):
+        change = cv2.dilate if large[frame] else cv2.erode
+        given[frame] = 2 * change((truth[frame] == 2).astype(np.uint8), np.ones((13, 13), np.uint8))
+    found = repaired(images, given)
+    assert found is not None
+    assert found.instances == [2]
+    ends = np.flatnonzero(np.diff(large))  # where the change is, both sides are averaged
+    after = [overlap(found[frame], truth[frame]) for frame in (*ends, *(ends + 1))]
+    assert max(overlap(given[frame], truth[frame]) for frame in ends) < 0.66
+    assert min(after) > 0.75
+
+
 @pytest.mark.parametrize("there", [slice(0, 130), slice(60, 80)])
 def test_in_a_long_video_a_sample_of_frames_tells_first(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, there: slice
@@ -90,7 +108,7 @@ def test_in_a_long_video_a_sample_of_frames_tells_first(
 def test_another_instance_keeps_its_pixels(rng: np.random.Generator) -> None:
     images, truth = clip(rng, [1.0] * FRAMES)
     given = flickering(truth, 4)
-    given[:, 80:110, 20:140][given[:, 80:110, 20:140] == 0] = 5
+    given[:, 50:, :34][given[:, 50:, :34] == 0] = 5  # beside it in the first frames, and whole after
     found = repaired(images, given)
     assert found is not None
     assert found.instances == [2]

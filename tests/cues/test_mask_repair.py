@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from mask_overlap import overlap
 
 from uni4d_fg.cues.mask_repair import RepairedMasks, missing_gaps, repair_masks
 from uni4d_fg.frontend.sequence.model import ArrayFrames
@@ -36,10 +37,6 @@ def repaired(images: np.ndarray, masks: np.ndarray) -> RepairedMasks | None:
     return repair_masks(ArrayFrames(images), ArrayFrames(masks), (HEIGHT, WIDTH))
 
 
-def overlap(first: np.ndarray, second: np.ndarray) -> float:
-    return float(np.count_nonzero((first > 0) & (second > 0)) / np.count_nonzero((first > 0) | (second > 0)))
-
-
 def test_missing_masks_are_made_and_no_other_is_touched(rng: np.random.Generator) -> None:
     images, truth = clip(rng, number=2**31 - 1)
     given = truth.copy()
@@ -56,6 +53,20 @@ def test_missing_masks_are_made_and_no_other_is_touched(rng: np.random.Generator
         else:
             np.testing.assert_array_equal(found[frame], truth[frame])
     assert (given[7] > 0).sum() == 15  # the masks that were given are not written to
+
+
+def test_masks_beside_may_be_cut_unlike(rng: np.random.Generator) -> None:
+    """One too large and the other too small, as segmenters cut them: the smaller lies in the larger."""
+    images, truth = clip(rng)
+    given = truth.copy()
+    given[7] = 0
+    for frame, change, px in ((6, cv2.dilate, 6), (8, cv2.erode, 3)):
+        given[frame] = 2 * change((truth[frame] == 2).astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), np.uint8))
+    assert overlap(given[6], given[8]) < 0.5
+    found = repaired(images, given)
+    assert found is not None
+    assert found.frames == [7]
+    assert overlap(found[7], truth[7]) > 0.85
 
 
 def test_only_the_lost_one_of_two_instances_is_made(rng: np.random.Generator) -> None:

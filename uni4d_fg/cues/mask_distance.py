@@ -58,10 +58,13 @@ def carried_distance(mask: BoolArray, flow: Float32Array) -> Float32Array:
     return warp_back(signed_distance(mask), flow, -BAND_PX)
 
 
-def overlap(first: BoolArray, second: BoolArray) -> float:
-    """Return intersection over union of two masks; 0 where both are empty."""
-    union = np.count_nonzero(first | second)
-    return float(np.count_nonzero(first & second) / union) if union else 0.0
+def shared(first: BoolArray, second: BoolArray) -> float:
+    """Return the part of the smaller of two masks that the other has too; 0 where one is empty.
+
+    Unlike intersection over union it does not ask whether both are cut equally large.
+    """
+    smaller = min(np.count_nonzero(first), np.count_nonzero(second))
+    return float(np.count_nonzero(first & second) / smaller) if smaller else 0.0
 
 
 @dataclass(frozen=True)

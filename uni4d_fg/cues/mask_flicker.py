@@ -14,13 +14,14 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray, Int32Array, evenly_spread
 from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray
-from uni4d_fg.cues.mask_distance import PackedDistance, carried_distance, overlap, shrunk_mask, signed_distance
+from uni4d_fg.cues.mask_distance import PackedDistance, carried_distance, shared, shrunk_mask, signed_distance
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.optim.threads import map_in_order, thread_count
 
-_UNSTABLE_PX = 1.5
-"""Borders that are this far from those of the frames beside, median over the frames, flicker: working px. Masks of good
-segmenters, and true ones, stay below 1."""
+_UNSTABLE_PX, _MOST_PX = 1.0, 4.0
+"""Borders that are as far from those of the frames beside as the first, in the mean over the frames, flicker: working
+px. Masks of good segmenters, and true ones, stay below 0.6. Not the median: masks that are cut too large, or too small,
+for some frames are alike there. No frame counts for more than the second: a thing may be hidden for a moment."""
 _NOT_FOLLOWED = 0.8
 """Part of that which is left when flow carries the masks of the frames beside, at least: what is less, a thing that
 really grows and shrinks, is seen by flow too."""
@@ -33,8 +34,9 @@ _TOGETHER = 8
 """Frames of each thread that are held at a time."""
 _SAMPLE = 48
 """Frames of an instance that are looked at before all are: flow is dear, and most masks are sound."""
-_OVERLAP = 0.4
-"""Intersection over union of a mask with one that is carried over: where it is less, flow has failed."""
+_SHARED = 0.6
+"""Part of a mask, or of one that is carried over if that is smaller, that the other has too: where it is less, flow has
+failed. One may be cut larger all around, which is what is looked for."""
 
 
 def may_flicker(area: FloatArray) -> bool:
@@ -45,7 +47,7 @@ def may_flicker(area: FloatArray) -> bool:
         return False
     own, before, after = (part[kept] for part in sides)
     # A border is at least as long as that of a disk, so that this is an upper bound of its way.
-    return float(np.median(np.abs(own - (before + after) / 2) / np.sqrt(4 * np.pi * own))) > _UNSTABLE_PX
+    return _usual(np.abs(own - (before + after) / 2) / np.sqrt(4 * np.pi * own)) > _UNSTABLE_PX
 
 
 def averaged_masks(
@@ -143,7 +145,7 @@ def _averaged(
             there = near[other][1] == label
             if np.count_nonzero(there) >= _LEAST_PX:
                 moved = carried_distance(there, shift)
-                if overlap(own, moved > 0) >= _OVERLAP:
+                if shared(own, moved > 0) >= _SHARED:
                     carried[other] = moved
         way: list[tuple[float, float]] = []
         if frame - 1 in carried and frame + 1 in carried:
@@ -166,5 +168,9 @@ def _flickers(ways: list[tuple[float, float]]) -> bool:
     """Tell from how far the border is from those beside, as they are and by flow, per frame, whether it flickers."""
     if len(ways) < _LEAST_FRAMES:
         return False
-    as_given, by_flow = np.median(ways, axis=0)
-    return bool(by_flow > _UNSTABLE_PX and by_flow >= _NOT_FOLLOWED * as_given)
+    as_given, by_flow = np.asarray(ways).T
+    return _usual(by_flow) > _UNSTABLE_PX and bool(np.median(by_flow) >= _NOT_FOLLOWED * np.median(as_given))
+
+
+def _usual(way: FloatArray) -> float:
+    return float(np.minimum(way, _MOST_PX).mean())

@@ -21,7 +21,7 @@ from uni4d_fg.cues.mask_distance import (
     PackedDistance,
     carried_distance,
     instance_areas,
-    overlap,
+    shared,
     shrunk_mask,
     working_size,
 )
@@ -43,8 +43,8 @@ _SAME_GRAY = 12.0
 """Median difference between the gray levels of a thing in two frames, at most."""
 _RETURN_PX = 1.5
 """Distance by which flow there and back misses where it began, working px, at most, for half of the thing."""
-_OVERLAP = 0.5
-"""Intersection over union of the masks from both sides, at least."""
+_SHARED = 2 / 3
+"""Part of the smaller of the masks from both sides that the other has too, at least: one may be cut larger."""
 _FREE = 0.5
 """Part of the carried mask without another instance, at least: the thing may have another number, or be hidden."""
 
@@ -232,7 +232,7 @@ def _between(gray: ImageArray, others: BoolArray, sides: list[_Beside], flow: De
             return None
         carried.append(distance)
     first, second = (distance > 0 for distance in carried)
-    if overlap(first, second) < _OVERLAP:
+    if shared(first, second) < _SHARED:
         return None
     mean = np.asarray((carried[0] + carried[1]) / 2, np.float32)
     inside = mean > 0
