@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -109,6 +111,17 @@ def frames(rng: np.random.Generator, broken: set[int], count: int = 12) -> list[
 def test_frames_that_contradict_the_scene_are_named_and_no_other(rng: np.random.Generator) -> None:
     assert contradicting_frames(frames(rng, {3, 8}), FusionConfig()) == [3, 8]
     assert contradicting_frames(frames(rng, set()), FusionConfig()) == []
+
+
+def test_a_constant_cue_before_a_wall_is_named(rng: np.random.Generator) -> None:
+    """Most landmarks are on the wall, for which a constant depth is as good as any; what stands before it tells."""
+    control = frames(rng, set())
+    for frame, points in enumerate(control):
+        wall = rng.uniform(3.9, 4.1, 200)
+        depth = np.where(np.arange(200) < 40, rng.uniform(1.0, 2.0, 200), wall)
+        cue = np.full(200, 4.0) if frame == 5 else depth * np.exp(0.05 * rng.standard_normal(200))
+        control[frame] = dataclasses.replace(points, cue=cue, log_scale=np.log(depth / cue))
+    assert contradicting_frames(control, FusionConfig()) == [5]
 
 
 def test_samples_that_err_alike_do_not_make_up_a_shift(rng: np.random.Generator) -> None:
