@@ -64,7 +64,7 @@ class CameraInitConfig(Section):
         1e-3, "Standard deviation of log(fx / fy) about the given intrinsics' own: pixels keep their shape.", gt=0
     )
     max_depth_spread: float | None = setting(
-        0.04,
+        0.025,
         "Where the depths of static points depart from frame to frame by more (a standard deviation of log depth), the "
         "cameras are found from the tracks alone, by structure from motion; null: always with the depth cue.",
         gt=0,

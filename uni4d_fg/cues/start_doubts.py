@@ -25,13 +25,19 @@ _FEW_FRAMES = 0.5
 """Fewer frames with a pose than this part of the video are warned of."""
 
 
-def start_doubts(structure: Structure, image_size: tuple[int, int], config: GeometricDepthConfig) -> list[str]:
+def start_doubts(
+    structure: Structure,
+    image_size: tuple[int, int],
+    config: GeometricDepthConfig,
+    remedy: str = "give K.npy if it is known",
+) -> list[str]:
     """Return one sentence for everything that a reader should know of the cameras.
 
     Args:
         structure: Cameras and what is known of them.
         image_size: (height, width), px.
         config: Its field ``usual_focal``.
+        remedy: What to do about a focal length that is open.
     """
     warnings = []
     bridged = np.flatnonzero(~structure.registered).tolist()
@@ -41,7 +47,7 @@ def start_doubts(structure: Structure, image_size: tuple[int, int], config: Geom
             f"{len(bridged)} frame(s) see too few points of the static scene, and their cameras are only interpolated"
             f"{' (most of the video: do not trust this result)' if severe else ''}: {some_of(bridged)}"
         )
-    warnings += _open_focal(structure)
+    warnings += _open_focal(structure, remedy)
     warnings += _doubtful_start(structure)
     focal = float(np.mean(structure.intrinsics[:2]))
     side = float(max(image_size))
@@ -49,7 +55,7 @@ def start_doubts(structure: Structure, image_size: tuple[int, int], config: Geom
     if not usual[0] * side <= focal <= usual[1] * side:
         warnings.append(
             f"the focal length found ({focal:.0f} px, {focal / side:.2f} of the longer image side) is unusual: moving "
-            "things without a mask, or motion from which it cannot be told; give K.npy if it is known"
+            f"things without a mask, or motion from which it cannot be told; {remedy}"
         )
     return warnings
 
@@ -70,7 +76,7 @@ def doubts_of_masks(before: FloatArray, after: FloatArray) -> list[str]:
     ]
 
 
-def _open_focal(structure: Structure) -> list[str]:
+def _open_focal(structure: Structure, remedy: str) -> list[str]:
     focal = float(np.mean(structure.intrinsics[:2]))
     below, above = structure.focal.relative(focal)
     if max(-below, above) <= _OPEN_FOCAL:
@@ -80,7 +86,7 @@ def _open_focal(structure: Structure) -> list[str]:
     return [
         f"this video leaves the focal length open: {focal:.0f} px was found, but from {low} to {high} explain the "
         f"tracks as well; depth, and motion along the viewing direction, stretch with it ({100 * below:+.0f} to "
-        f"{100 * above:+.0f} %); give K.npy if it is known"
+        f"{100 * above:+.0f} %); {remedy}"
     ]
 
 

@@ -30,6 +30,7 @@ from uni4d_fg.progress import Reporter
 from uni4d_fg.slam.stages.observations import Observations, observations_of
 
 _STEP = "structure_from_motion"
+_REMEDY = "set input.intrinsics=fixed if those that were given are right"
 
 
 def without_poor_depth(
@@ -98,6 +99,7 @@ def structure_step(
         Cancelled: If the user interrupts.
     """
     # Hundreds of milliseconds to load, and most runs need nothing of it.
+    from uni4d_fg.cues.start_doubts import start_doubts, start_summary
     from uni4d_fg.cues.structure.motion import structure_from_motion
 
     spread = float(cameras["depth_spread"])
@@ -129,8 +131,8 @@ def structure_step(
             f"{100 * found.focal_sigma:.1f} %"
         ],
         "depth_spread": spread,
-        "focal_sigma": found.focal_sigma,
-        "unexplained": found.unexplained,
+        "start": start_summary(found),
+        "warnings": start_doubts(found, sequence.image_size, config.geometric_depth, _REMEDY),
     }
     arrays = {"world_T_cam": poses, "intrinsics": found.intrinsics, "focal_sigma": np.array(found.focal_sigma)}
     return StageRecord(arrays, summary)
