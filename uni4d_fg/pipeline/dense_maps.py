@@ -20,7 +20,7 @@ from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
 from uni4d_fg.results.fusion.lifting import lifted
 from uni4d_fg.results.fusion.mask_band import STILL, looks_moving, stands_still
-from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_preferred, tells_bleeding
+from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_poor, is_preferred, tells_bleeding
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import (
@@ -207,7 +207,7 @@ class DenseMaps:
             tried.append(judged.errors)
             if measured is not None and tells_bleeding(judged.errors):
                 bled.append(self._bleeding(sound[at], judged, measured))
-        self.bleeding_px = bleeding_of(bled, self._noise)
+        self.bleeding_px = bleeding_of(bled, poor=self._cue_is_poor)
         # One choice for the whole video: between frames that are matched and others that are not, surfaces would jump.
         preferred = [self._prefers(errors) for errors in tried]
         self.prefers_matching = 2 * sum(preferred) > len(preferred)
@@ -444,7 +444,11 @@ class DenseMaps:
 
     def _prefers(self, errors: HeldOut) -> bool:
         """Tell whether matched depth is the better one, as far as a frame says; once it is known whether cues bleed."""
-        return is_preferred(errors, self.bleeding_px, self._noise)
+        return is_preferred(errors, self.bleeding_px, poor=self._cue_is_poor)
+
+    @property
+    def _cue_is_poor(self) -> bool:
+        return is_poor(self._noise, self.sequence.depth_parallax)
 
     @property
     def _noise(self) -> float:

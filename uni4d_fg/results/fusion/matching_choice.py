@@ -14,10 +14,22 @@ _NOT_WORSE = 1.5
 """... and below this one if the cue bleeds: landmarks do not lie on edges."""
 _FAR_WORSE = 4.0
 """If depth that was matched without comparing frames is above this in one frame, nothing more is tried."""
-_POOR, _POOR_BLEEDS_PX, _NOT_WORSE_THAN_POOR = 0.04, 6.0, 3.0
-"""A cue whose noise, a standard deviation of the log, is above the first is a network's: it bleeds across edges by the
-second, working px, at least, whether a few frames show it or not, and only matched depth has its edges right. Landmarks
-prefer it all the same, as it was corrected by others beside them: matched depth is used below the third."""
+_POOR = 0.04
+"""Noise, a standard deviation of the log depth, from which a cue is a network's."""
+_POOR_BLEEDS_PX, _NOT_WORSE_THAN_POOR = 6.0, 3.0
+"""A poor cue bleeds across edges by the first, working px, at least, whether a few frames show it or not, and only
+matched depth has its edges right. Landmarks prefer it all the same, as others beside them made or corrected it: matched
+depth is used below the second."""
+
+
+def is_poor(noise: float, depth_parallax: bool | None) -> bool:
+    """Tell whether a cue has no edges of its own: a network's, or depth that was interpolated between points.
+
+    Args:
+        noise: Of the cue at landmarks, a standard deviation of the log depth.
+        depth_parallax: Whether depth from motion saw any; None for depth that was given.
+    """
+    return noise > _POOR or depth_parallax is True
 
 
 def adds_nothing(errors: HeldOut) -> bool:
@@ -33,31 +45,31 @@ def tells_bleeding(errors: HeldOut) -> bool:
     return _counts(errors, _NOT_WORSE, bleeds=True)
 
 
-def bleeding_of(radii: list[float], noise: float) -> float:
+def bleeding_of(radii: list[float], *, poor: bool) -> float:
     """Return how far a cue bleeds, working px; 0 for one that has the detail of edges.
 
     Args:
         radii: Of the frames that tell; NaN for those that do not.
-        noise: Of the cue at landmarks, a standard deviation of the log depth.
+        poor: See :func:`is_poor`.
     """
     known = [radius for radius in radii if np.isfinite(radius)]
     radius = float(np.median(known)) if known else 0.0
-    if noise > _POOR:
+    if poor:
         radius = max(radius, _POOR_BLEEDS_PX)
     return radius if radius > _SHARP_PX else 0.0
 
 
-def is_preferred(errors: HeldOut, bleeding_px: float, noise: float) -> bool:
+def is_preferred(errors: HeldOut, bleeding_px: float, *, poor: bool) -> bool:
     """Tell whether matched depth is the better one, as far as a frame says.
 
     Args:
         errors: Of both in the frame.
         bleeding_px: How far the cue bleeds, see :func:`bleeding_of`.
-        noise: Of the cue at landmarks, a standard deviation of the log depth.
+        poor: See :func:`is_poor`.
     """
     if bleeding_px == 0:
         return _counts(errors, _BETTER, bleeds=False)
-    return _counts(errors, _NOT_WORSE_THAN_POOR if noise > _POOR else _NOT_WORSE, bleeds=True)
+    return _counts(errors, _NOT_WORSE_THAN_POOR if poor else _NOT_WORSE, bleeds=True)
 
 
 def _counts(errors: HeldOut, limit: float, *, bleeds: bool) -> bool:

@@ -1,11 +1,11 @@
 """How sure static depth is once frames are averaged, and how far it is off in the mean, fitted to scenes with truth.
 
 The probability that a pixel is right to 3 % is a logistic function of what its own frame says, of the other frames
-that see it, of the edges beside it, and where the cue bleeds of how far depth bends. The mean error is the geometric
-mean of two estimates that err differently: the error that goes with such probabilities on scenes with truth, and how
-far landmarks are from the depth at pixels as sure as theirs. (Landmarks do not see the errors that they share with the
-depth, those of the cameras. They also lie on texture, where depth is best, and beside edges, where it is worst:
-comparing equally sure pixels takes this out.)
+that see it, of the edges beside it, and where the cue bleeds of how far depth bends. The mean error is a geometric
+mean of two estimates that err differently: the error that goes with such probabilities on scenes with truth, which
+counts twice, and how far landmarks are from the depth at pixels as sure as theirs. (Landmarks do not see the errors
+that they share with the depth, those of the cameras. They also lie on texture, where depth is best, and beside edges,
+where it is worst: comparing equally sure pixels takes this out, in part.)
 """
 
 from __future__ import annotations
@@ -29,8 +29,10 @@ _MOST_BENT = np.float32(0.015)
 """Relative bend of inverse depth over neighboring pixels from which on depth is as likely between two surfaces."""
 _BESIDE_WINDOW = np.ones((3, 3), np.uint8)
 _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
-_SURE_ERROR, _WRONG_ERROR = 0.0025, 0.08
-"""Mean error at a probability of 1, and what a lower one adds per unit."""
+_WRONG_ERROR, _FALL = 0.2, 3.5
+"""Mean error at a probability of 0, and by which exponent it falls until 1: to 0.006."""
+_PRIOR_SHARE = 2 / 3
+"""Of what is told, in the logarithm, that such errors have; the rest is the landmarks'."""
 _MIN_COMPARED = 10
 
 
@@ -97,7 +99,7 @@ class ToldError:
         sure = confidence[counted]
         above = [np.count_nonzero(sure >= np.float32(limit)) for limit in _BINS]
         self.pixels -= np.diff([len(sure), *above, 0])
-        self.expected += (_SURE_ERROR + _WRONG_ERROR) * len(sure) - _WRONG_ERROR * float(sure.sum(dtype=np.float64))
+        self.expected += _WRONG_ERROR * float(np.exp(-_FALL * sure).sum(dtype=np.float64))
         column, row = np.rint(uv).astype(np.int64).T
         inside = (column >= 0) & (row >= 0) & (column < static.shape[1]) & (row < static.shape[0])
         inside[inside] = counted[row[inside], column[inside]]
@@ -124,4 +126,5 @@ class ToldError:
         if len(everywhere) < _MIN_COMPARED:
             return prior
         typical = [float(np.median(off if len(off) >= _MIN_COMPARED else everywhere)) for off in found]
-        return float(np.sqrt(prior * (self.pixels @ np.array(typical)) / total))
+        at_landmarks = float(self.pixels @ np.array(typical)) / total
+        return prior**_PRIOR_SHARE * at_landmarks ** (1.0 - _PRIOR_SHARE)
