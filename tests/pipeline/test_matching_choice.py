@@ -5,12 +5,34 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pipeline_scenes import TINY, make_config, make_scene
 
 from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.pipeline import dense_maps, reconstruct
+from uni4d_fg.results.fusion.matching_choice import bleeding_of, is_poor, is_preferred
 from uni4d_fg.results.fusion.static_depth import HeldOut
+
+
+def test_a_poor_cue_bleeds_and_is_matched_unless_far_worse() -> None:
+    """A network's, by its noise, and depth between points of motion; whatever a few frames show of either."""
+    assert [is_poor(0.05, None), is_poor(0.002, True), is_poor(0.02, None), is_poor(0.002, False)] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+    assert bleeding_of([1.0, np.nan], poor=False) == 0.0
+    assert bleeding_of([5.0, 9.0, np.nan], poor=False) == 7.0
+    sharp, poor = bleeding_of([], poor=False), bleeding_of([], poor=True)
+    assert sharp == 0.0
+    assert poor == 6.0
+    for ratio, of_poor, of_other in ((0.9, True, True), (2.0, True, False), (3.5, False, False)):
+        errors = HeldOut(0.01, ratio, True)
+        assert is_preferred(errors, poor, poor=True) is of_poor
+        assert is_preferred(errors, sharp, poor=False) is of_other
+    assert is_preferred(HeldOut(0.01, 1.4, True), 7.0, poor=False)
 
 
 @pytest.mark.skipif(find_extension()[0] is None, reason="needs the C++ extension")

@@ -3,7 +3,7 @@
 The probability that a pixel is right to 3 % is a logistic function of what its own frame says, of the other frames
 that see it, of the edges beside it, and where the cue bleeds of how far depth bends. The mean error is a geometric
 mean of two estimates that err differently: the error that goes with such probabilities on scenes with truth, which
-counts twice, and how far landmarks are from the depth at pixels as sure as theirs. (Landmarks do not see the errors
+counts for more, and how far landmarks are from the depth at pixels as sure as theirs. (Landmarks do not see the errors
 that they share with the depth, those of the cameras. They also lie on texture, where depth is best, and beside edges,
 where it is worst: comparing equally sure pixels takes this out, in part.)
 """
@@ -29,9 +29,11 @@ _MOST_BENT = np.float32(0.015)
 """Relative bend of inverse depth over neighboring pixels from which on depth is as likely between two surfaces."""
 _BESIDE_WINDOW = np.ones((3, 3), np.uint8)
 _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
-_WRONG_ERROR, _FALL = 0.2, 3.5
-"""Mean error at a probability of 0, and by which exponent it falls until 1: to 0.006."""
-_PRIOR_SHARE = 2 / 3
+_SURENESS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0], np.float32)
+_ERRORS = np.array([0.2, 0.09, 0.045, 0.024, 0.0125, 0.0045, 0.0025], np.float32)
+"""Mean errors at these probabilities, linear in between: of clips of two renderers, from the video alone and with cues
+as networks make them."""
+_PRIOR_SHARE = 0.7
 """Of what is told, in the logarithm, that such errors have; the rest is the landmarks'."""
 _MIN_COMPARED = 10
 
@@ -99,7 +101,7 @@ class ToldError:
         sure = confidence[counted]
         above = [np.count_nonzero(sure >= np.float32(limit)) for limit in _BINS]
         self.pixels -= np.diff([len(sure), *above, 0])
-        self.expected += _WRONG_ERROR * float(np.exp(-_FALL * sure).sum(dtype=np.float64))
+        self.expected += float(np.interp(sure, _SURENESS, _ERRORS).sum())
         column, row = np.rint(uv).astype(np.int64).T
         inside = (column >= 0) & (row >= 0) & (column < static.shape[1]) & (row < static.shape[0])
         inside[inside] = counted[row[inside], column[inside]]
@@ -127,4 +129,4 @@ class ToldError:
             return prior
         typical = [float(np.median(off if len(off) >= _MIN_COMPARED else everywhere)) for off in found]
         at_landmarks = float(self.pixels @ np.array(typical)) / total
-        return prior**_PRIOR_SHARE * at_landmarks ** (1.0 - _PRIOR_SHARE)
+        return float(prior**_PRIOR_SHARE * at_landmarks ** (1.0 - _PRIOR_SHARE))
