@@ -18,9 +18,9 @@ from uni4d_fg.cues.mask_distance import PackedDistance, carried_distance, shared
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.optim.threads import map_in_order, thread_count
 
-_UNSTABLE_PX, _MOST_PX = 1.0, 4.0
+_UNSTABLE_PX, _MOST_PX = 1.7, 4.0
 """Borders that are as far from those of the frames beside as the first, in the mean over the frames, flicker: working
-px. Masks of good segmenters, and true ones, stay below 0.6. Not the median: masks that are cut too large, or too small,
+px. Masks of good segmenters, and true ones, stay below 1. Not the median: masks that are cut too large, or too small,
 for some frames are alike there. No frame counts for more than the second: a thing may be hidden for a moment."""
 _NOT_FOLLOWED = 0.8
 """Part of that which is left when flow carries the masks of the frames beside, at least: what is less, a thing that

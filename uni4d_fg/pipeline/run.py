@@ -222,7 +222,7 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
     )
     solved, solved_tracks, config = camera.apply(solved, solved_tracks, config)
     config = settings_behind_lens(config, sequence, depth_is_needed=not alone)
-    key = stage_key(key, sequence.focal_sigma, config.camera_init)
+    key = stage_key(key, sequence.focal_sigma)
     key, scene, motion = _stages(run, key, solved, solved_tracks, config, windows, run_stage, fragments, loops, static)
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)

@@ -90,7 +90,7 @@ def camera_init_step(
         ]
     cameras = result.cameras
     arrays = {"world_T_cam": cameras.world_T_cam, "intrinsics": cameras.intrinsics}
-    if config.camera_init.max_depth_spread is not None and energy_of(config).is_likelihood:
+    if energy_of(config).is_likelihood:
         static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
         arrays["depth_spread"] = np.array(depth_spread(static, cameras))
     return StageRecord(arrays, summary)

@@ -32,6 +32,9 @@ from uni4d_fg.slam.stages.observations import Observations, observations_of
 _STEP = "structure_from_motion"
 _REMEDY = "set input.intrinsics=fixed if those that were given are right"
 
+_POSED = 0.9
+"""Part of the frames that must have a pose: stage 2 finds that of others, from one between those of their neighbors."""
+
 
 def without_poor_depth(
     run: RunInProgress, key: str, sequence: Sequence, labelled: LabelledTracks, cameras: Arrays, config: Config
@@ -106,6 +109,8 @@ def structure_step(
     said = f"depths of static points depart by {100 * spread:.0f} % from frame to frame"
     kept = {name: cameras[name] for name in ("world_T_cam", "intrinsics")}
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(2)
+    if len(np.unique(static.track)) < config.geometric_depth.min_pose_points:
+        return StageRecord(kept, {"facts": [f"{said}; cameras are found with them all the same, as tracks are few"]})
     try:
         found = structure_from_motion(
             replace(static, weight=np.ones(len(static)), depth=np.full(len(static), np.nan)),
@@ -116,8 +121,8 @@ def structure_step(
         raise Cancelled(STOPPED) from error
     except SolverError as error:
         return StageRecord(kept, {"facts": [f"{said}; no cameras were found without them: {error}"]})
-    if found is None or not found.registered.all():
-        why = "the camera hardly moves" if found is None else "some frames see too few points"
+    if found is None or found.registered.mean() < _POSED:
+        why = "the camera hardly moves" if found is None else "many frames see too few points"
         return StageRecord(kept, {"facts": [f"{said}; cameras are found with them all the same, as {why}"]})
     poses = np.linalg.inv(found.world_T_cam[0]) @ found.world_T_cam
     row = np.full(len(labelled.label), -1)
