@@ -37,7 +37,7 @@ def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed:
     (``bundle_adjustment.trim_sigmas``). Their intrinsics are kept, as a stage that takes all tracks for independent
     would go to the focal length that their common errors ask for. And depth from motion is no cue for the cameras: what
     is interpolated between points that were found with them knows nothing that the tracks do not know, and is wrong
-    behind every edge.
+    behind every edge. Nor is it judged as a cue that was given, and a cue that the scale hangs on is not given up.
 
     Args:
         config: Of the run, as :func:`settings_for_depth` returns it.
@@ -45,17 +45,16 @@ def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed:
         depth_is_needed: Whether what the run does relies on a depth prior for the scale of the world.
     """
     if sequence.focal_sigma is not None:
-        config = settings_of_motion(config, depth_prior=config.bundle_adjustment.depth_prior)
+        config = settings_of_motion(config)
     if sequence.depth_parallax and not (config.geometric_depth.depth_prior or depth_is_needed):
-        stage = config.bundle_adjustment.model_copy(update={"depth_prior": False})
-        config = config.model_copy(update={"bundle_adjustment": stage})
+        config = without_depth_prior(config)
     if sequence.depth_parallax is not None or depth_is_needed:
         stage_1 = config.camera_init.model_copy(update={"max_depth_spread": None})
         config = config.model_copy(update={"camera_init": stage_1})
     return config
 
 
-def settings_of_motion(config: Config, *, depth_prior: bool) -> Config:
+def settings_of_motion(config: Config) -> Config:
     """Return the configuration of stage 2 for cameras that structure from motion found.
 
     Their intrinsics are held, and tracks that depart from most others are left out.
@@ -65,6 +64,12 @@ def settings_of_motion(config: Config, *, depth_prior: bool) -> Config:
     return config.model_copy(
         update={
             "input": config.input.model_copy(update={"intrinsics": "fixed"}),
-            "bundle_adjustment": stage.model_copy(update={"trim_sigmas": trim, "depth_prior": depth_prior}),
+            "bundle_adjustment": stage.model_copy(update={"trim_sigmas": trim}),
         }
     )
+
+
+def without_depth_prior(config: Config) -> Config:
+    """Return the configuration with which the depth cue says nothing of the cameras."""
+    stage = config.bundle_adjustment.model_copy(update={"depth_prior": False})
+    return config.model_copy(update={"bundle_adjustment": stage})

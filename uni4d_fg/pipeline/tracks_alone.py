@@ -14,19 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, rows_by_group
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.depth_settings import settings_of_motion
+from uni4d_fg.cues.depth_settings import settings_of_motion, without_depth_prior
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
-from uni4d_fg.geometry.camera import NEAR_PLANE, seen_from
+from uni4d_fg.geometry import se3
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.pipeline.fingerprint import stage_key
 from uni4d_fg.pipeline.in_progress import RunInProgress
 from uni4d_fg.pipeline.steps import STOPPED, Arrays
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.progress import Reporter
+from uni4d_fg.slam.stages.lifting import frame_log_scales
 from uni4d_fg.slam.stages.observations import Observations, observations_of
 
 _STEP = "structure_from_motion"
@@ -55,15 +56,17 @@ def without_poor_depth(
     Raises:
         Cancelled: If the user interrupts.
     """
-    if not is_poor(cameras, config):
+    if not _is_poor(cameras, config):
         run.forget(_STEP)
         return sequence, config, cameras, key
     key = stage_key(key, config.geometric_depth, config.bundle_adjustment)
-    found = run.step(_STEP, key, lambda hooks: structure_step(sequence, labelled, cameras, config, hooks, run.reporter))
-    return *with_known_cameras(sequence, found, config), found, key
+    found = run.step(
+        _STEP, key, lambda hooks: _structure_step(sequence, labelled, cameras, config, hooks, run.reporter)
+    )
+    return *_with_known_cameras(sequence, found, config), found, key
 
 
-def is_poor(cameras: Arrays, config: Config) -> bool:
+def _is_poor(cameras: Arrays, config: Config) -> bool:
     """Tell from the record of stage 1 whether the cameras are to be found without the depth cue."""
     limit = config.camera_init.max_depth_spread
     return limit is not None and "depth_spread" in cameras and bool(cameras["depth_spread"] > limit)
@@ -85,7 +88,7 @@ class _Steps:
         pass
 
 
-def structure_step(
+def _structure_step(
     sequence: Sequence, labelled: LabelledTracks, cameras: Arrays, config: Config, hooks: Hooks, reporter: Reporter
 ) -> StageRecord:
     """Find cameras by structure from motion; those of stage 1 are kept where the motion shows none.
@@ -124,12 +127,11 @@ def structure_step(
     if found is None or found.registered.mean() < _POSED:
         why = "the camera hardly moves" if found is None else "many frames see too few points"
         return StageRecord(kept, {"facts": [f"{said}; cameras are found with them all the same, as {why}"]})
-    poses = np.linalg.inv(found.world_T_cam[0]) @ found.world_T_cam
+    poses = se3.inverse(found.world_T_cam[0]) @ found.world_T_cam
     row = np.full(len(labelled.label), -1)
     row[found.track] = np.arange(len(found.track))
-    some = static.select(row[static.track] >= 0)
-    z = seen_from(found.world_T_cam, some.frame, found.points.position[row[some.track]])[:, 2]
-    poses[:, :3, 3] *= _scale(some, z, len(poses))
+    some = static.select((row[static.track] >= 0) & np.isfinite(static.depth))
+    poses[:, :3, 3] *= _scale(some, found.world_T_cam, found.points.position[row[some.track]])
     summary: dict[str, Any] = {
         "facts": [
             f"{said}, so the tracks alone find the cameras: fx {found.intrinsics[0]:.1f} px, known to "
@@ -143,19 +145,17 @@ def structure_step(
     return StageRecord(arrays, summary)
 
 
-def _scale(observations: Observations, z: FloatArray, num_frames: int) -> float:
-    """Return the factor on depths ``z`` (N,) with which the median frame agrees with its cue."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = np.log(observations.depth / np.where(z > NEAR_PLANE, z, np.nan))
-    known = np.flatnonzero(np.isfinite(ratio))
-    frames = rows_by_group(observations.frame[known], num_frames)
-    medians = [np.median(ratio[known[rows]]) for rows in frames if len(rows)]
-    return float(np.exp(np.median(medians))) if medians else 1.0
+def _scale(observations: Observations, world_T_cam: FloatArray, points: FloatArray) -> float:
+    """Return the factor on the depths of observed points (N, 3) with which the median frame agrees with its cue."""
+    known = np.asarray(np.isfinite(points).all(axis=1))
+    seen = observations.select(known)
+    scales = frame_log_scales(seen, world_T_cam, points[known], len(world_T_cam))[np.unique(seen.frame)]
+    return float(np.exp(-np.median(scales))) if len(scales) else 1.0
 
 
-def with_known_cameras(sequence: Sequence, cameras: Arrays, config: Config) -> tuple[Sequence, Config]:
-    """Return what stage 2 solves from the record of :func:`structure_step`: focal lengths and the use of depth."""
+def _with_known_cameras(sequence: Sequence, cameras: Arrays, config: Config) -> tuple[Sequence, Config]:
+    """Return what stage 2 solves from the record of :func:`_structure_step`: focal lengths and the use of depth."""
     if "focal_sigma" not in cameras:
         return sequence, config
     sequence = replace(sequence, focal_sigma=float(cameras["focal_sigma"]))
-    return sequence, settings_of_motion(config, depth_prior=False)
+    return sequence, without_depth_prior(settings_of_motion(config))

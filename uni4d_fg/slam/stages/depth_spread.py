@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.arrays import rows_by_group
-from uni4d_fg.geometry.camera import NEAR_PLANE, seen_from
-from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.stages.proximal import lift_noise
 from uni4d_fg.slam.stages.scene import Cameras
 from uni4d_fg.slam.stages.structure import mean_lift
 
@@ -27,9 +25,5 @@ def depth_spread(observations: Observations, cameras: Cameras) -> float:
     """
     seen = observations.select(np.isfinite(observations.depth)).with_min_observations(_SEEN)
     _, row = seen.rows()
-    z = seen_from(cameras.world_T_cam, seen.frame, mean_lift(seen, cameras)[row])[:, 2]
-    off = np.log(np.maximum(z, NEAR_PLANE) / seen.depth)
-    for rows in rows_by_group(seen.frame, len(cameras.world_T_cam)):
-        if len(rows):
-            off[rows] -= np.median(off[rows])
-    return robust_sigma(off)
+    noise = lift_noise(seen, mean_lift(seen, cameras)[row], cameras)
+    return float("nan") if noise is None else noise.sigma
