@@ -52,7 +52,7 @@ class CameraConfig(Section):
     max_iterations: int = setting(100, "Linearizations of a joint solve, at most.", ge=1)
     probe_steps: int = setting(2, "Undamped steps from which the evidence for distortion is read.", ge=1)
     min_evidence: float = setting(
-        0.003, "Part of the reprojection energy that free distortion must take away to be taken.", ge=0, lt=1
+        0.002, "Part of the reprojection energy that free distortion must take away to be taken.", ge=0, lt=1
     )
     min_further_evidence: float = setting(
         0.001,

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from warping import warp_sequence
 from zooming import ramp, zoom_sequence
 
 from uni4d_fg.config.load import load_config
@@ -22,6 +23,7 @@ from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel, Tracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.camera import project, world_to_camera
+from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.results.evaluate.run import evaluate_run
 from uni4d_fg.results.export.run import export_run
@@ -31,6 +33,7 @@ from uni4d_fg.results.residuals import reprojection_residuals
 from uni4d_fg.results.run import Run
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
+from uni4d_fg.slam.lens.fit import LensFit
 from uni4d_fg.slam.lens.tracks import unzoomed_tracks
 
 pytest.importorskip("open3d")
@@ -104,6 +107,39 @@ def test_residuals_and_exports_have_a_camera_per_frame(runs: dict[str, tuple[Pat
     assert model.compute_mean_reprojection_error() < 1.2
     frames = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())["frames"]
     np.testing.assert_allclose([f["fl_x"] for f in frames], result.frame_intrinsics[:, 0])
+
+
+def test_a_zoom_of_which_the_first_undamped_step_says_nothing() -> None:
+    """The step is refused, and the damped one in its place gains 0.01 % of the energy."""
+    ratio = ramp(24, 0.6)
+    plain = scene(seed=11, num_frames=24, grid_columns=20, grid_rows=15)
+    found = calibrated(zoom_sequence(plain, ratio / ratio.min()))
+    assert found.zoom is not None
+    assert found.zoom.zoom is not None
+    np.testing.assert_allclose(found.intrinsics[0] * found.zoom.zoom, 300.0 * ratio / ratio.min(), rtol=0.01)
+
+
+def test_a_zoom_that_distortion_seems_to_explain_is_compared_with_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever two steps say of distortion: the zoom explains all tracks together better than the lens found."""
+    ratio = ramp(FRAMES)
+    monkeypatch.setattr(LensFit, "probe", lambda fit, scene: 0.9)
+    found = calibrated(zoom_sequence(scene(), ratio))
+    assert found.zoom is not None
+    assert found.zoom.zoom is not None
+    assert found.lens.is_pinhole
+    np.testing.assert_allclose(found.intrinsics[0] * found.zoom.zoom, 300.0 * ratio, rtol=0.03)
+    assert found.candidates
+    assert "better than the lens does" in found.zoom.notes[1]
+
+
+def test_a_lens_is_no_zoom_however_loudly_tracks_ask_for_one() -> None:
+    plain = scene(num_frames=20)
+    assert plain.ground_truth.intrinsics is not None
+    lens = Lens("SIMPLE_RADIAL", (-0.2,))
+    found = calibrated(warp_sequence(plain, plain.ground_truth.intrinsics, lens), "camera.min_zoom_evidence=0")
+    assert found.zoom is not None
+    assert found.zoom.zoom is None
+    assert found.lens.parameters[0] == pytest.approx(-0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("more", [{"seed": 2}, {"path": "forward"}])

@@ -30,7 +30,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit
-from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom
+from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
@@ -138,6 +138,21 @@ def calibrate_lens(
         note = f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"
         return LensCalibration(Lens(), intrinsics, [], fit.solves, note, zoom)
     judge = HeldOut(config, some.without(~held_out), run, hooks)
+    best, candidates = _find_lens(fit, judge, pinhole, evidence, settings, image_size)
+    if zoom is not None and zoom.beside_lens:
+        compared = solve_zoom(zooming, pinhole.scene, best, count, settings)
+        if compared.zoom is not None:
+            return LensCalibration(Lens(), compared.intrinsics, candidates, fit.solves, zoom=compared)
+        zoom = replace(zoom, notes=zoom.notes + compared.notes)
+    known = intrinsics if best is pinhole else best.intrinsics
+    return LensCalibration(best.lens, known, candidates, fit.solves, zoom=zoom)
+
+
+def _find_lens(
+    fit: LensFit, judge: HeldOut, pinhole: FittedLens, evidence: float, settings: CameraConfig,
+    image_size: tuple[int, int],
+) -> tuple[FittedLens, list[LensCandidate]]:  # fmt: skip
+    """Fit models of one and two parameters; return the richest that is taken, the pinhole if none, and those tried."""
     best, candidates = pinhole, list[LensCandidate]()
     richer: tuple[LensModel, ...] = ("SIMPLE_RADIAL", "RADIAL")
     for model in richer:
@@ -151,9 +166,7 @@ def calibrate_lens(
         if not taken:
             break
         best = found
-    if best is pinhole:
-        return LensCalibration(Lens(), intrinsics, candidates, fit.solves, zoom=zoom)
-    return LensCalibration(best.lens, best.intrinsics, candidates, fit.solves, zoom=zoom)
+    return best, candidates
 
 
 def is_taken(

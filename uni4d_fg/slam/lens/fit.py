@@ -228,15 +228,16 @@ class HeldOut:
 
     def gain(self, fit: FittedLens, other: FittedLens) -> float:
         """Return the part by which a fit explains the tracks better than another: of the median track's energy."""
-        ours, theirs = self._both(fit, other)
+        ours, theirs = self.both(fit, other)
         return float(np.median(theirs - ours) / np.median(theirs)) if len(ours) else 0.0
 
     def better(self, fit: FittedLens, other: FittedLens) -> float:
         """Return the part of the tracks that a fit explains better than another; half where there are none."""
-        ours, theirs = self._both(fit, other)
+        ours, theirs = self.both(fit, other)
         return float(np.mean(ours < theirs)) if len(ours) else 0.5
 
-    def _both(self, fit: FittedLens, other: FittedLens) -> tuple[FloatArray, FloatArray]:
+    def both(self, fit: FittedLens, other: FittedLens) -> tuple[FloatArray, FloatArray]:
+        """Return the energies of the tracks (M,) that both of two fits see, under the one and the other."""
         ours, theirs = self.energies(fit), self.energies(other)
         known = np.isfinite(ours) & np.isfinite(theirs)
         return ours[known], theirs[known]

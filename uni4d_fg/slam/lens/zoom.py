@@ -8,6 +8,9 @@ told apart by the relief of the scene and by its depth. The covariance of the so
 
 A thing that moves and that no mask covers lets a zoom take away energy, too: its own, at the cost of what stands. A
 zoom that is one explains most tracks better.
+
+A camera that does not zoom can end far from one that does, where a few steps say little of the zoom and distortion
+takes away more. A zoom that is asked for beside a lens is therefore solved after it, and compared with it.
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.camera import CameraConfig
+from uni4d_fg.geometry.lens import PINHOLE
+from uni4d_fg.slam.lens.fit import FittedLens
 from uni4d_fg.slam.lens.zoom_fit import FittedZoom, ZoomFit
 from uni4d_fg.slam.stages.scene import StaticScene
 
@@ -36,10 +41,12 @@ class ZoomCalibration:
     """Standard deviation of the log focal length, relative to the first frame, where it is largest."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    beside_lens: bool = False
+    """Whether tracks ask for a zoom, but for distortion more: :func:`solve_zoom` compares it with the lens."""
 
 
 def find_zoom(work: ZoomFit, scene: StaticScene, num_frames: int, config: CameraConfig) -> ZoomCalibration:
-    """Find the focal length of every frame.
+    """Find the focal length of every frame, where the tracks ask for that first.
 
     Args:
         work: The tracks, and how they are fitted.
@@ -55,34 +62,55 @@ def find_zoom(work: ZoomFit, scene: StaticScene, num_frames: int, config: Camera
     none = ZoomCalibration(None, scene.cameras.intrinsics, 0.0, 0.0)
     if work.frames[-1] + stride < num_frames:
         return replace(none, notes=(f"no zoom was sought: tracks are too short for {num_frames} frames",))
+    if config.zoom == "on":
+        return solve_zoom(work, scene, FittedLens(PINHOLE, scene), num_frames, config)
     probe = work.probe(scene)
-    warnings = _warnings(probe)
-    moved = float(np.ptp(probe.zoom))
-    if config.zoom == "auto" and (probe.evidence < config.min_zoom_evidence or moved < _PROBED * config.min_zoom):
-        note = f"a focal length per frame would lower the reprojection energy by {100 * probe.evidence:.2f} %"
-        return ZoomCalibration(None, scene.cameras.intrinsics, probe.evidence, _spread(probe), (note,), warnings)
-    distortion = work.fit.probe(scene) if config.zoom == "auto" and config.model == "auto" else 0.0
+    said = f"a focal length per frame would lower the reprojection energy by {100 * probe.evidence:.2f} %"
+    none = replace(none, evidence=probe.evidence, open_by=_spread(probe), warnings=_warnings(probe))
+    moves = float(np.ptp(probe.zoom)) >= _PROBED * config.min_zoom or probe.evidence >= _LOUD
+    if probe.evidence < config.min_zoom_evidence or not moves:
+        return replace(none, notes=(said,))
+    distortion = work.fit.probe(scene) if config.model == "auto" else 0.0
     if distortion > probe.evidence:
-        note = (
-            f"a focal length per frame would lower the reprojection energy by {100 * probe.evidence:.2f} %, "
-            f"distortion by {100 * distortion:.2f} %"
-        )
-        return ZoomCalibration(None, scene.cameras.intrinsics, probe.evidence, _spread(probe), (note,), warnings)
+        return replace(none, notes=(f"{said}, distortion by {100 * distortion:.2f} %",), beside_lens=True)
+    return solve_zoom(work, scene, FittedLens(PINHOLE, scene), num_frames, config)
+
+
+def solve_zoom(
+    work: ZoomFit, scene: StaticScene, rival: FittedLens, num_frames: int, config: CameraConfig
+) -> ZoomCalibration:
+    """Solve for the focal length of every frame to the end, and take it if it explains the tracks best.
+
+    Args:
+        work: The tracks, and how they are fitted.
+        scene: Stages 1 and 2 of a camera that does not zoom.
+        rival: The camera that the zoom is compared with: that pinhole, or a lens.
+        num_frames: T of the video.
+        config: What is asked for.
+
+    Raises:
+        DegenerateProblemError: If the cues do not determine the cameras.
+        SolverError: If a system is singular or a cue is not finite.
+    """
     found = work.solve(scene)
     for _ in range(1, config.rounds):
         found = work.refine(found)
     warnings = _warnings(found)
+    none = ZoomCalibration(None, scene.cameras.intrinsics, found.evidence, _spread(found), warnings=warnings)
     span = float(np.expm1(np.ptp(found.zoom)))
     note = f"a focal length per frame lowers the reprojection energy by {100 * found.evidence:.2f} %"
     if config.zoom == "auto" and (found.evidence < config.min_zoom_evidence or span < config.min_zoom):
-        note += f" and varies by {100 * span:.1f} % only"
-        return ZoomCalibration(None, scene.cameras.intrinsics, found.evidence, _spread(found), (note,), warnings)
+        return replace(none, notes=(f"{note} and varies by {100 * span:.1f} % only",))
     if config.zoom == "auto":
         agreement = work.agreement(found, scene)
         note += f" and explains {100 * agreement:.0f} % of the tracks better"
         if agreement < config.min_zoom_agreement:
-            warnings = (_ONLY_PART.format(100 * agreement),)
-            return ZoomCalibration(None, scene.cameras.intrinsics, found.evidence, _spread(found), (note,), warnings)
+            return replace(none, notes=(note,), warnings=(_ONLY_PART.format(100 * agreement),))
+        if not rival.lens.is_pinhole:
+            gain = work.gain(found, scene, rival)
+            note += f"; all tracks together {100 * gain:.0f} % better than the lens does"
+            if gain <= 0.0:
+                return replace(none, notes=(note,))
     if not found.focal_sigma <= _FOCAL_OPEN:
         warnings += (_FOCAL_IS_OPEN,)
     focal = found.intrinsics[0] * np.exp(np.interp(np.arange(num_frames), work.frames, found.zoom))
@@ -94,6 +122,10 @@ def find_zoom(work: ZoomFit, scene: StaticScene, num_frames: int, config: Camera
 
 _PROBED = 0.4
 """Part of a zoom that the undamped steps of the probe find, at least."""
+
+_LOUD = 0.05
+"""Evidence from which the probe need not move the focal length: a camera that ended far from a zoom does not in two
+steps, while errors of recordings ask for 1 to 2 %."""
 
 _OPEN = 0.03
 """Standard deviation of the log focal length from which it counts as open."""

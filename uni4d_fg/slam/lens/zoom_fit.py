@@ -54,7 +54,12 @@ class ZoomFit:
 
     def probe(self, scene: StaticScene) -> FittedZoom:
         """Set the zoom free at the minimum of a camera that does not zoom, for a few undamped steps."""
-        steps = {"max_iterations": self.fit.config.camera.probe_steps, "initial_damping": 1e-9}
+        # The first may be refused, and what a damped one gains in its place is no reason to stop.
+        steps = {
+            "max_iterations": self.fit.config.camera.probe_steps,
+            "initial_damping": 1e-9,
+            "relative_decrease": 0.0,
+        }
         return self.solve(scene, steps)
 
     def refine(self, start: FittedZoom) -> FittedZoom:
@@ -116,9 +121,25 @@ class ZoomFit:
         Raises:
             SolverError: If a system is singular.
         """
-        judge = HeldOut(self.fit.config, self.more_tracks, self.fit.run, self.fit.hooks)
-        zoomed = FittedLens(PINHOLE, replace(scene, cameras=found.cameras), zoom=found.zoom)
-        return judge.better(zoomed, FittedLens(PINHOLE, scene))
+        return self._judge().better(self._zoomed(found, scene), FittedLens(PINHOLE, scene))
+
+    def gain(self, found: FittedZoom, scene: StaticScene, lens: FittedLens) -> float:
+        """Return the part by which a zoom lowers the energy of all tracks together below that of a lens.
+
+        Not that of the median track: most are short, and either camera explains them.
+
+        Raises:
+            SolverError: If a system is singular.
+        """
+        ours, theirs = self._judge().both(self._zoomed(found, scene), lens)
+        return 1.0 - float(ours.sum() / max(theirs.sum(), 1e-300))
+
+    def _judge(self) -> HeldOut:
+        return HeldOut(self.fit.config, self.more_tracks, self.fit.run, self.fit.hooks)
+
+    @staticmethod
+    def _zoomed(found: FittedZoom, scene: StaticScene) -> FittedLens:
+        return FittedLens(PINHOLE, replace(scene, cameras=found.cameras), zoom=found.zoom)
 
     def _problem(self, scene: StaticScene) -> tuple[Problem, State]:
         """Return bundle adjustment of a scene with the zoom in place of one focal length."""
