@@ -10,12 +10,8 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, SolverError
-from uni4d_fg.factors.camera_priors import fisheye_camera_prior, opencv_camera_prior
-from uni4d_fg.factors.factor_type import FactorType
-from uni4d_fg.factors.lens_reprojection import fisheye_reprojection, opencv_reprojection
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable import VariableType
-from uni4d_fg.factors.variable_types import FISHEYE_CAMERA, INTRINSICS, LANDMARK, LOG_SCALE, OPENCV_CAMERA, POSE
+from uni4d_fg.factors.variable_types import LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
@@ -23,6 +19,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.lens.problems import RealPixels, lens_family, lens_problem
 from uni4d_fg.slam.lens.tracks import ideal_tracks, ideal_weight, unzoomed_tracks
 from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.stages.bundle_adjustment import (
@@ -160,9 +157,9 @@ class LensFit:
         self, scene: StaticScene, lens: Lens, model: LensModel, options: Mapping[str, float] | None = None
     ) -> FittedLens:
         """Solve with the parameters held, and then free: what the second gains is the evidence for them."""
-        variable, reprojection, prior = _family(model)
         camera_config, ba = self.config.camera, self.config.bundle_adjustment
-        problem, state = self._problem(scene, lens, variable, reprojection, prior)
+        variable, _, _ = lens_family(model)
+        problem, state = self._problem(scene, lens, model)
         until_the_end = {
             "relative_decrease": camera_config.relative_decrease,
             "max_iterations": camera_config.max_iterations,
@@ -183,37 +180,24 @@ class LensFit:
         evidence = gain / max(before.final_energies["static_reprojection"], 1e-300)
         return FittedLens(Lens.of(model, camera[4:]), moved, evidence)
 
-    def _problem(
-        self, scene: StaticScene, lens: Lens, variable: VariableType, reprojection: FactorType, prior: FactorType
-    ) -> tuple[Problem, State]:
+    def _problem(self, scene: StaticScene, lens: Lens, model: LensModel) -> tuple[Problem, State]:
         """Return bundle adjustment of a scene with the reprojection through a lens in place of the pinhole's."""
         ba, seen, pinhole = self.config.bundle_adjustment, scene.observations, scene.state()
-        camera = np.concatenate([scene.cameras.intrinsics, lens.padded])[None]
-        arrays = {v: array for v, array in pinhole.arrays.items() if v is not INTRINSICS}
-        state = State({variable: camera, **arrays}, pinhole.index)
         others = bundle_adjustment_problem(
             pinhole, seen, scene.noise, ba, self.prior_intrinsics[None],
             Freedom(poses=True, intrinsics=False), acceleration=scene.acceleration,
         )  # fmt: skip
-        problem = Problem.over(state).eliminate(LANDMARK).fix(POSE, rows=[0])
-        problem.add(batch for batch in others.batches if all(s.variable is not INTRINSICS for s in batch.slots))
         _, row = seen.rows()
         real = self.tracks.tracks.uv[seen.track, seen.frame].astype(np.float64)
         # Those of stage 2, drift included, without what ideal pixels lose.
         weight = seen.weight / ideal_weight(lens, scene.cameras.intrinsics, seen.uv)
         sigma = scene.noise.reprojection_sigma_px
-        noise = MAP.observed(sigma, weight, ba.reprojection_kernel, seen.frame, len(state[POSE]))
-        problem.add(reprojection(seen.frame, row, 0, uv=real, **noise))
-        fx, fy = self.prior_intrinsics[:2]
-        wide = np.concatenate(
-            [
-                ba.focal_prior_fraction * np.array([fx, fy, fx, fy]),
-                np.full(4, self.config.camera.parameter_prior_sigma),
-                [ba.aspect_prior_sigma],
-            ]
-        )
-        center = np.concatenate([self.prior_intrinsics, np.zeros(4)])
-        return problem.add(prior(0, measured=center[None], log_aspect=[np.log(fx / fy)], sigma=wide[None])), state
+        noise = MAP.observed(sigma, weight, ba.reprojection_kernel, seen.frame, len(pinhole[POSE]))
+        return lens_problem(
+            pinhole, others.batches, RealPixels(seen.frame, row, real, noise),
+            np.concatenate([scene.cameras.intrinsics, lens.padded]), model, self.prior_intrinsics, ba,
+            self.config.camera,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -264,13 +248,6 @@ class HeldOut:
         energy = np.log1p(np.minimum(error / ba.reprojection_sigma_px, _FAR) ** 2)
         out[tracks] = np.bincount(row, energy) / np.bincount(row)
         return out
-
-
-def _family(model: LensModel) -> tuple[VariableType, FactorType, FactorType]:
-    """Return the variable of a model's family, its reprojection and its prior."""
-    if model == "OPENCV_FISHEYE":
-        return FISHEYE_CAMERA, fisheye_reprojection, fisheye_camera_prior
-    return OPENCV_CAMERA, opencv_reprojection, opencv_camera_prior
 
 
 def _errors(

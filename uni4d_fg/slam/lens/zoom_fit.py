@@ -9,15 +9,14 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.factors.state import State
-from uni4d_fg.factors.static_reprojection import static_reprojection
-from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE, ZOOM
-from uni4d_fg.factors.zoom import zoom_smoothness, zoomed_reprojection
+from uni4d_fg.factors.variable_types import INTRINSICS, LOG_SCALE, POSE, ZOOM
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit
+from uni4d_fg.slam.lens.problems import RealPixels, zoom_problem
 from uni4d_fg.slam.lens.tracks import unzoomed_tracks
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import MAP
@@ -98,7 +97,7 @@ class ZoomFit:
         to_the_end = {"relative_decrease": camera.relative_decrease, "max_iterations": camera.max_iterations}
         solver = ba.solver.model_copy(update=dict(options or to_the_end))
         before = problem.energies(state)["static_reprojection"]
-        stage = Stage("lens", problem.fix(ZOOM, rows=[0]), solver, part="zoom")
+        stage = Stage("lens", problem, solver, part="zoom")
         state, after = self.fit.run(stage, state, self.fit.hooks)
         self.fit.note([after])
         gain = after.initial_energy - after.final_energy
@@ -144,20 +143,13 @@ class ZoomFit:
     def _problem(self, scene: StaticScene) -> tuple[Problem, State]:
         """Return bundle adjustment of a scene with the zoom in place of one focal length."""
         fit, seen, plain = self.fit, scene.observations, scene.state()
-        ba, count = fit.config.bundle_adjustment, len(self.frames)
-        state = State({**plain.arrays, ZOOM: np.zeros((count, 1))}, plain.index)
+        ba = fit.config.bundle_adjustment
         others = bundle_adjustment_problem(
             plain, seen, scene.noise, ba, fit.prior_intrinsics[None], Freedom(poses=True, intrinsics=True),
             acceleration=scene.acceleration,
         )  # fmt: skip
-        problem = Problem.over(state).eliminate(LANDMARK).fix(POSE, rows=[0])
-        if not ba.free_principal_point:
-            problem.fix(INTRINSICS, entries=[2, 3])
-        problem.add(batch for batch in others.batches if batch.factor_type is not static_reprojection)
         _, row = seen.rows()
         sigma = scene.noise.reprojection_sigma_px
-        noise = MAP.observed(sigma, seen.weight, ba.reprojection_kernel, seen.frame, count)
-        problem.add(zoomed_reprojection(seen.frame, row, 0, seen.frame, uv=seen.uv, **noise))
-        first = np.arange(count - 1)
-        step = fit.config.camera.zoom_per_frame * np.sqrt(np.diff(self.frames))
-        return problem.add(zoom_smoothness(first, first + 1, sigma=step[:, None])), state
+        noise = MAP.observed(sigma, seen.weight, ba.reprojection_kernel, seen.frame, len(self.frames))
+        pixels = RealPixels(seen.frame, row, seen.uv, noise)
+        return zoom_problem(plain, others.batches, pixels, self.frames, ba, fit.config.camera)
