@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray
+from uni4d_fg.arrays import Float32Array, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.depth_range import DepthRange, depth_range
 from uni4d_fg.cues.guided_filter import sum_colors
-from uni4d_fg.cues.static_scene import predict_static_at
+from uni4d_fg.cues.static_scene import StaticPrediction
 
 _MEDIAN_OF_SQUARE = 0.455
 """Of the square of a standard normal variable."""
@@ -83,8 +83,7 @@ def frame_appearance(
 def moved_evidence(
     source: FrameAppearance,
     target: FrameAppearance,
-    target_T_source: FloatArray,
-    intrinsics: FloatArray,
+    static: StaticPrediction,
     shared: tuple[Float32Array, Float32Array] | None,
     config: MotionMaskConfig,
 ) -> Float32Array:
@@ -93,14 +92,11 @@ def moved_evidence(
     Args:
         source: Frame the evidence is for.
         target: Frame it is compared with.
-        target_T_source: (4, 4) pose of the source camera in the target camera.
-        intrinsics: (4,) px at working size.
+        static: Where a static scene has its pixels (h, w), px at working size.
         shared: Displacements (h, w) in x and y that errors of the cameras cause, px at working size; None for none.
         config: Sigmas.
     """
     height, width = source.contrast.shape
-    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
-    static = predict_static_at(columns, rows, source.z, target_T_source, intrinsics)
     u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
     if shared is not None:
         u, v = u + shared[0], v + shared[1]

@@ -21,6 +21,7 @@ from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_ma
 from uni4d_fg.cues.plan import CuePlan, CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.cues.start_doubts import doubts_of_masks
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.bars import without_bars
@@ -99,6 +100,11 @@ class _Gathering:
         self.intrinsics_of_motion: FloatArray | None = None
         self.world_T_cam = video.initial_world_T_cam
         self.cameras_of_motion: FloatArray | None = None
+        self.camera: MotionCamera | None = None
+        if not video.lens.is_pinhole and video.intrinsics is not None:
+            self.camera = MotionCamera(video.intrinsics, video.lens)
+            # They belong to the lens.
+            self.config = config.model_copy(update={"input": config.input.model_copy(update={"intrinsics": "fixed"})})
         self.moving_tracks: BoolArray | None = None
         self.motion_has_parallax = False
         self.motion_facts: list[str] = []
@@ -136,6 +142,7 @@ class _Gathering:
                 self.video, depths=depths, masks=masks, intrinsics=self._best_intrinsics(), tracks=self.tracks,
                 initial_world_T_cam=self.world_T_cam, content=None, depth_is_metric=report.metric,
                 depth_parallax=self.depth_parallax, focal_sigma=self.focal_sigma,
+                lens=self.video.lens if self.camera is None else self.camera.lens, zoom=self._zoom(),
             )
         )  # fmt: skip
         if not plan.is_given:
@@ -225,8 +232,9 @@ class _Gathering:
 
         def from_motion(intrinsics: FloatArray) -> GeometricDepth:
             return geometric_depth(
-                masked, tracks, static, intrinsics, self._key(), self.folder, config, self.reporter, self.should_stop
-            )
+                masked, tracks, static, intrinsics, self.camera, self._key(), self.folder, config, self.reporter,
+                self.should_stop,
+            )  # fmt: skip
 
         found = from_motion(self._start_intrinsics())
         if not found.has_parallax and self.intrinsics_of_motion is not None:
@@ -238,6 +246,8 @@ class _Gathering:
         self.cameras_of_motion = found.world_T_cam
         self.moving_tracks = found.moving
         self.intrinsics_of_motion, self.focal_sigma = found.intrinsics, found.focal_sigma
+        if found.has_parallax:
+            self.camera = found.camera
         if video.intrinsics is None:
             report.sources["intrinsics"] = "from camera motion"
         self.motion_facts = [f"depth: {fact}" for fact in found.facts]
@@ -257,12 +267,17 @@ class _Gathering:
     def _motion_masks(self, depths: FrameSource[Float32Array]) -> FrameSource[Int32Array]:
         tracks = self._any_tracks()
         masks, facts, warnings = moving_masks(
-            self.video, depths, tracks, self._best_intrinsics(), self._key(), _name_of(depths), self.moving_tracks,
+            self.video, depths, tracks, self._best_camera(), self._key(), _name_of(depths), self.moving_tracks,
             self.folder, self.config, self.reporter, self.should_stop,
         )  # fmt: skip
         self.report.facts += [f"masks: {fact}" for fact in facts]
         self.report.warnings += warnings
         return masks
+
+    def _best_camera(self) -> MotionCamera:
+        """Return what is known of the camera so far, its lens and zoom too."""
+        camera = self.camera or MotionCamera(self._best_intrinsics())
+        return replace(camera, intrinsics=self._best_intrinsics())
 
     def _best_intrinsics(self) -> FloatArray:
         """Return what is known of the intrinsics so far, (4,) px, from camera motion too."""
@@ -274,6 +289,11 @@ class _Gathering:
         Also in the second round: a focal length that the motion left open is no knowledge for the next.
         """
         return guess_intrinsics(self.video.image_size) if self.intrinsics is None else self.intrinsics
+
+    def _zoom(self) -> FloatArray | None:
+        """Return the focal length of each frame over the longest (T,); None where the camera does not zoom."""
+        zoom = None if self.camera is None else self.camera.zoom
+        return self.video.zoom if zoom is None else np.exp(zoom)
 
     def _key(self) -> str:
         if self._video_key is None:

@@ -32,6 +32,7 @@ from uni4d_fg.cues.structure.motion import (
     rotations_only,
     structure_from_motion,
 )
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
@@ -63,6 +64,8 @@ class GeometricDepth:
     """False if the camera stays in one place, so that depth is a convention."""
     focal_sigma: float
     """Standard deviation of the log of the focal lengths that were found; 0 for those that were held."""
+    camera: MotionCamera
+    """Lens and zoom, with the intrinsics."""
     facts: tuple[str, ...]
     """What was found, one line each."""
     warnings: tuple[str, ...]
@@ -82,6 +85,7 @@ def depth_from_motion(
     reporter: Reporter | None = None,
     should_stop: Callable[[], bool] | None = None,
     with_doubts: bool = True,
+    camera: MotionCamera | None = None,
 ) -> GeometricDepth:
     """Find cameras and up-to-scale depth from tracks of the static scene.
 
@@ -95,6 +99,8 @@ def depth_from_motion(
         reporter: Progress.
         should_stop: Polled often.
         with_doubts: Also look for what the motion leaves open; not needed of what only leads to masks.
+        camera: A lens or a zoom that is known, with the intrinsics to start from; None looks for one, as section
+            ``camera`` says.
 
     Raises:
         InputError: If tracks, video and ``is_static`` do not fit each other.
@@ -115,10 +121,13 @@ def depth_from_motion(
             "everything marked as moving?) and the tracks, or give depth maps"
         )
     structure = structure_from_motion(
-        observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop, with_doubts
-    )
+        observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop, with_doubts,
+        camera=camera, any_camera=camera is None,
+    )  # fmt: skip
     if structure is None:
-        return _without_parallax(video, tracks, is_static, observations, intrinsics, config.geometric_depth)
+        ideal = camera or MotionCamera(intrinsics)
+        observations = ideal.ideal_observations(observations)
+        return _without_parallax(video, tracks, is_static, observations, ideal, config.geometric_depth)
     return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
 
 
@@ -133,8 +142,11 @@ def _with_maps(
 ) -> GeometricDepth:
     """Scale the structure and make depth maps of it."""
     settings = config.geometric_depth
-    structure = _normalize(structure, observations, settings.median_depth)
-    inverse = _inverse_depths(structure, observations, settings)
+    ideal = structure.camera.ideal_observations(observations)
+    structure = _normalize(structure, ideal, settings.median_depth)
+    inverse = _inverse_depths(structure, ideal, settings)
+    # Maps are those of the images.
+    observations = replace(ideal, uv=structure.camera.real(ideal.uv, ideal.frame))
     sparse = np.full(tracks.visible.shape, np.nan, dtype=np.float32)
     known = np.isfinite(inverse)
     sparse[observations.track[known], observations.frame[known]] = 1.0 / inverse[known]
@@ -149,6 +161,7 @@ def _with_maps(
         f"(parallax {structure.pair.parallax_px:.0f} px); {int(structure.registered.sum())} of {video.num_frames} "
         f"frames posed, {triangulated} of {len(structure.track)} static tracks triangulated, "
         f"noise {structure.sigma_px:.2f} px, fx {fx:.1f} fy {fy:.1f} px",
+        *structure.camera.facts(),
         f"scale by convention: median depth of the first frame is {settings.median_depth:g}",
         f"focal length between {structure.focal.low:.0f} and {structure.focal.high:.0f} px (95 %); the cameras explain "
         f"{100 * (1.0 - structure.unexplained):.0f} % of what was held out",
@@ -159,8 +172,8 @@ def _with_maps(
     moving = np.zeros(tracks.num_tracks, dtype=bool)
     moving[structure.track] = structure.moving
     return GeometricDepth(
-        depths, structure.world_T_cam, structure.intrinsics, sparse, moving, True, structure.focal_sigma, facts,
-        warnings, start,
+        depths, structure.world_T_cam, structure.intrinsics, sparse, moving, True, structure.focal_sigma,
+        structure.camera, facts, warnings, start,
     )  # fmt: skip
 
 
@@ -247,7 +260,8 @@ def _place(
     reporter.end()
     depths = replace(depths, grids=tuple(grids))
     contacts = smooth_over_time(standing, depths.config.contact_smoothing)
-    placed = place_moving(contacts, sightings, structure.world_T_cam, structure.intrinsics)
+    ideal = structure.camera.ideal_tracks(tracks)
+    placed = place_moving(contacts, sightings, ideal, structure.world_T_cam, structure.intrinsics)
     facts = [
         f"moving thing {label} is {ratio:.1f} times nearer than what is seen below it, as the camera's shake tells"
         for label, ratio in placed.nearer.items()
@@ -265,11 +279,12 @@ def _without_parallax(
     tracks: Tracks,
     is_static: BoolArray,
     observations: Observations,
-    intrinsics: FloatArray,
+    camera: MotionCamera,
     config: GeometricDepthConfig,
 ) -> GeometricDepth:
     """Return depth for a camera that stays in one place: a sphere around it, which a rotation does not change."""
     height, width = video.image_size
+    intrinsics = camera.intrinsics
     nodes = np.stack(
         np.meshgrid(
             np.append(np.arange(0, width - 1, _SPHERE_STEP), width - 1),
@@ -290,7 +305,7 @@ def _without_parallax(
         f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
     )
     moving = np.zeros(tracks.num_tracks, dtype=bool)
-    return GeometricDepth(depths, poses, intrinsics, sparse, moving, False, 0.0, ("no parallax",), warnings)
+    return GeometricDepth(depths, poses, intrinsics, sparse, moving, False, 0.0, camera, ("no parallax",), warnings)
 
 
 def _on_sphere(uv: FloatArray, intrinsics: FloatArray, radius: float) -> FloatArray:

@@ -19,6 +19,7 @@ from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.interpolated_depth import GridDepths, InterpolatedDepths
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import MaskFolder
@@ -32,8 +33,8 @@ _RECORD = "start"
 
 
 def geometric_depth(
-    video: Video, tracks: Tracks, is_static: BoolArray, intrinsics: FloatArray, images_key: str, folder: Path,
-    config: Config, reporter: Reporter, should_stop: ShouldStop,
+    video: Video, tracks: Tracks, is_static: BoolArray, intrinsics: FloatArray, camera: MotionCamera | None,
+    images_key: str, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
 ) -> GeometricDepth:  # fmt: skip
     """Find depth from the motion of the camera, unless it is there already.
 
@@ -42,6 +43,7 @@ def geometric_depth(
         tracks: K tracks.
         is_static: (K,) which of them may be believed to stand still.
         intrinsics: (4,) px, known or to start from.
+        camera: A lens or a zoom that is known; None looks for one.
         images_key: Key of the images.
         folder: Of the cues.
         config: Of all parts.
@@ -54,8 +56,8 @@ def geometric_depth(
         Cancelled: If ``should_stop`` turned true.
     """
     key = maker_key(
-        config.geometric_depth, config.bundle_adjustment, config.input, images_key, _tracks_key(tracks),
-        _digest(is_static), intrinsics.tolist(), masks_key(video),
+        config.geometric_depth, config.bundle_adjustment, config.input, config.camera, images_key, _tracks_key(tracks),
+        _digest(is_static), intrinsics.tolist(), _camera_key(camera), masks_key(video),
     )  # fmt: skip
     target = folder / "depth" / f"motion-{key}"
     cache = FrameCache(target)
@@ -65,7 +67,7 @@ def geometric_depth(
     names = [f"{frame:06d}" for frame in range(video.num_frames)]
     if stored is None or not (leads_to_masks or all(cache.has_map(name, video.image_size) for name in names)):
         result = depth_from_motion(
-            video, tracks, is_static, intrinsics, config, reporter, should_stop, with_doubts=not leads_to_masks
+            video, tracks, is_static, intrinsics, config, reporter, should_stop, not leads_to_masks, camera
         )
         arrays: dict[str, npt.NDArray[Any]] = {}
         if leads_to_masks:
@@ -77,7 +79,7 @@ def geometric_depth(
         cache.put_arrays(
             _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
             moving=result.moving, has_parallax=np.array([result.has_parallax]),
-            focal_sigma=np.array([result.focal_sigma]), said=np.array(said), **arrays,
+            focal_sigma=np.array([result.focal_sigma]), camera=result.camera.to_array(), said=np.array(said), **arrays,
         )  # fmt: skip
         stored = _stored_structure(cache, tracks, leads_to_masks)
         assert stored is not None
@@ -90,7 +92,8 @@ def geometric_depth(
     return GeometricDepth(
         depths, stored["world_T_cam"], stored["intrinsics"],
         stored["sparse"].astype(np.float32), stored["moving"], bool(stored["has_parallax"][0]),
-        float(stored["focal_sigma"][0]), tuple(facts), tuple(warnings), start,
+        float(stored["focal_sigma"][0]), MotionCamera.of_array(stored["camera"], stored["intrinsics"]), tuple(facts),
+        tuple(warnings), start,
     )  # fmt: skip
 
 
@@ -105,14 +108,14 @@ def _grids(depths: FrameSource[Float32Array], reporter: Reporter, should_stop: S
 
 def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> dict[str, npt.NDArray[Any]] | None:
     ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "moving": 1, "said": None}
-    ranks |= {"has_parallax": 1, "focal_sigma": 1}
+    ranks |= {"has_parallax": 1, "focal_sigma": 1, "camera": 1}
     ranks |= {"grids": 3} if with_grids else {}
     stored = cache.arrays(_RECORD, ranks)
     return stored if stored is not None and stored["sparse"].shape == tracks.visible.shape else None
 
 
 def moving_masks(
-    video: Video, depths: FrameSource[Float32Array], tracks: Tracks, intrinsics: FloatArray, images_key: str,
+    video: Video, depths: FrameSource[Float32Array], tracks: Tracks, camera: MotionCamera, images_key: str,
     depth_key: str, moving: BoolArray | None, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
 ) -> tuple[MaskFolder, list[str], list[str]]:  # fmt: skip
     """Find what moves, unless that is there already; ``moving`` (K,) are tracks of which it is known.
@@ -127,7 +130,8 @@ def moving_masks(
     """
     key = maker_key(
         config.motion_masks, config.camera_init, config.bundle_adjustment, config.labels, config.input, images_key,
-        depth_key, _tracks_key(tracks), intrinsics.tolist(), "" if moving is None else _digest(moving),
+        depth_key, _tracks_key(tracks), camera.intrinsics.tolist(), _camera_key(camera),
+        "" if moving is None else _digest(moving),
     )  # fmt: skip
     target = folder / "masks" / f"motion-{key}"
     cache = FrameCache(target)
@@ -135,7 +139,9 @@ def moving_masks(
     if said is not None and labels_are_stored(target, video.num_frames, video.image_size):
         facts, warnings = json.loads(str(said["said"]))
         return open_labels(target, video.num_frames, video.image_size), facts, warnings
-    result = motion_masks(video, depths, tracks, intrinsics, config.motion_masks, reporter, should_stop, config, moving)
+    result = motion_masks(
+        video, depths, tracks, camera.intrinsics, config.motion_masks, reporter, should_stop, config, moving, camera
+    )
     cache.put_arrays("said", said=np.array(json.dumps([result.facts, result.warnings])))
     masks = store_labels(iter(result.labels), video.num_frames, video.image_size, target, "masks to disk", reporter)
     return masks, list(result.facts), list(result.warnings)
@@ -165,6 +171,10 @@ def masks_key(video: Video) -> str:
     for mask in video.masks:
         digest.update(np.ascontiguousarray(mask).data)
     return digest.hexdigest()
+
+
+def _camera_key(camera: MotionCamera | None) -> str:
+    return "" if camera is None or camera.is_plain else _digest(camera.to_array())
 
 
 def _tracks_key(tracks: Tracks) -> str:

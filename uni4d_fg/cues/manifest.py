@@ -19,6 +19,7 @@ from uni4d_fg.frontend.sequence.frames import FileFrames, MaskFolder, no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.sequence.poses import load_poses
 from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
+from uni4d_fg.geometry.lens import Lens, LensModel
 from uni4d_fg.reading import check_regular, read_json
 
 MANIFEST = "cues.json"
@@ -45,6 +46,8 @@ class Manifest(BaseModel):
     static: bool
     tracks: str | None
     intrinsics: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+    lens: tuple[LensModel, tuple[FiniteFloat, ...]] = ("PINHOLE", ())
+    zoom: list[FiniteFloat] | None = None
     initial_world_T_cam: str | None
     report: _Report
 
@@ -73,6 +76,8 @@ def save_manifest(
             "static": plan.masks == "none",
             "tracks": _relative(track_file, folder) if made_tracks and track_file is not None else None,
             "intrinsics": sequence.intrinsics.tolist(),
+            "lens": [sequence.lens.model, list(sequence.lens.parameters)],
+            "zoom": None if sequence.zoom is None else sequence.zoom.tolist(),
             _POSES: _poses(sequence, video, folder),
             "report": report.to_dict(),
         },
@@ -114,6 +119,10 @@ def load_cues(video: Video, folder: Path) -> tuple[Sequence, CueReport]:
             f"{video.num_frames} of {list(video.image_size)}; was the video replaced? Make the cues again"
         )
     changes: dict[str, Any] = {"intrinsics": np.array(stored.intrinsics), "depth_is_metric": stored.report.metric}
+    changes["lens"] = Lens(*stored.lens)
+    if stored.zoom is not None:
+        check_count(path, len(stored.zoom), video.num_frames)
+        changes["zoom"] = np.array(stored.zoom)
     if stored.depth is not None:
         changes["depths"] = FloatMaps(_paths(stored.depth, folder, video), video.image_size)
     if stored.masks is not None:

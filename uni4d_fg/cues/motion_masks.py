@@ -34,9 +34,11 @@ from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.label_store import CompressedLabels
 from uni4d_fg.cues.moving_regions import moving_region, track_evidence, trusted_components
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
+from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.static_scene import relative_pose
 from uni4d_fg.cues.structure.motion import observations_of_tracks, structure_from_motion
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.track_motion import QuadraticGrid, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
@@ -73,6 +75,7 @@ def motion_masks(
     should_stop: Callable[[], bool] | None = None,
     solver: Config | None = None,
     known_moving: BoolArray | None = None,
+    camera: MotionCamera | None = None,
 ) -> MotionMasks:
     """Find what moves in a video by comparing it with a static scene.
 
@@ -87,6 +90,7 @@ def motion_masks(
         solver: Stages 1 and 2 and their minimizer; None takes the defaults.
         known_moving: (K,) tracks that are known to contradict a static scene; None lets them be found from the tracks
             alone (:mod:`uni4d_fg.cues.structure`), as a thing that moves by little stays within the sigmas of depth.
+        camera: A lens or a zoom that is known, with its intrinsics, which are held; None for a pinhole.
 
     Raises:
         InputError: If depth or tracks do not fit the images, or depth is missing wherever there is a track.
@@ -99,15 +103,17 @@ def motion_masks(
         if count != video.num_frames:
             raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
+    camera = camera or MotionCamera(intrinsics)
+    ideal = camera.ideal_tracks(tracks)
     if known_moving is None:
-        known_moving = _contradicting(tracks, video.image_size, intrinsics, settings, report, stop)
+        known_moving = _contradicting(ideal, video.image_size, intrinsics, settings, report, stop)
     report.begin("motion of tracks", config.camera_rounds)
     cameras, motion = _tracks_and_cameras(
-        video, depths, tracks, intrinsics, known_moving, config, settings, report, stop
+        video, depths, tracks, ideal, camera, known_moving, config, settings, report, stop
     )
     report.end()
     report.begin("motion masks", video.num_frames)
-    comparison = _Comparison(video, depths, tracks, cameras, motion, config)
+    comparison = _Comparison(video, depths, tracks, cameras, camera, motion, config)
     labels = CompressedLabels(video.image_size)
     seen_in: dict[int, int] = {}
     found = comparison.detections(stop)
@@ -144,7 +150,8 @@ def _tracks_and_cameras(
     video: Video,
     depths: FrameSource[Float32Array],
     tracks: Tracks,
-    intrinsics: FloatArray,
+    ideal: Tracks,
+    camera: MotionCamera,
     known_moving: BoolArray,
     config: MotionMaskConfig,
     settings: Config,
@@ -152,29 +159,31 @@ def _tracks_and_cameras(
     stop: Callable[[], bool],
 ) -> tuple[Cameras, TrackMotion]:
     """Solve cameras, test tracks, and do both once more without the tracks that move."""
+    intrinsics = camera.intrinsics
     known = StaticTracks.of(video, depths, tracks, intrinsics, settings)
     if not np.isfinite(known.labelled.depth).any():
         raise InputError(
             f"motion masks: none of {tracks.num_tracks} tracks has depth in any frame; give depth that is not missing, "
             "or let it come from the motion of the camera"
         )
-    spread = spread_at_tracks(known.labelled.tracks, depths, max(1, round(config.depth_edge_px)))
-    outlier = find_outlier_tracks(known.labelled, intrinsics, config)
+    spread = spread_at_tracks(tracks, depths, max(1, round(config.depth_edge_px)))
+    labelled = replace(known.labelled, tracks=ideal)
+    outlier = find_outlier_tracks(labelled, intrinsics, config)
     outlier |= known_moving
     moving = outlier
     cameras, motion = None, None
     for turn in range(config.camera_rounds):
         cameras = solve_cameras(
-            known.labelled.without(moving),
+            labelled.without(moving),
             intrinsics,
             settings,
             # Among the first, what moves would be explained by a wrong focal length.
-            free_intrinsics=config.free_intrinsics and turn > 0,
+            free_intrinsics=config.free_intrinsics and turn > 0 and camera.is_plain,
             observations_per_frame=config.max_bundle_observations,
             should_stop=stop,
         )
         is_last = turn == config.camera_rounds - 1
-        motion = find_moving_tracks(known.labelled, spread, cameras, video.image_size, config, with_shared=is_last)
+        motion = find_moving_tracks(labelled, spread, cameras, video.image_size, config, with_shared=is_last)
         motion = replace(motion, moving=motion.moving | outlier, static=motion.static & ~outlier)
         moving = motion.moving
         report.advance(turn + 1)
@@ -209,17 +218,15 @@ class _Comparison:
         depths: FrameSource[Float32Array],
         tracks: Tracks,
         cameras: Cameras,
+        camera: MotionCamera,
         motion: TrackMotion,
         config: MotionMaskConfig,
     ) -> None:
         self.video, self.depths, self.tracks = video, depths, tracks
         self.cameras, self.motion, self.config = cameras, motion, config
         self.size = shrunk_size(video.image_size, working_scale(video.image_size, config.working_size_px))
-        # Pixel centers are integers: (u + 1/2) scales.
         self.scale = np.array([self.size[1] / video.image_size[1], self.size[0] / video.image_size[0]])
-        fx, fy, cx, cy = cameras.intrinsics
-        sx, sy = self.scale
-        self.intrinsics = np.array([fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5])
+        self.pixels = PixelGrid.of(replace(camera, intrinsics=cameras.intrinsics), self.size, self.scale)
         self.grid = QuadraticGrid.of(self.size, self.scale, video.image_size)
         self.images: dict[int, ImageArray] = {}
         self.frames: dict[int, FrameAppearance] = {}
@@ -292,9 +299,8 @@ class _Comparison:
         error = self.motion.shared.get(pair)
         shared = None if error is None else self.grid.displacement(error)
         pose = relative_pose(self.cameras.world_T_cam, source, target)
-        return moved_evidence(
-            self._frame(source), self._frame(target), pose, self.intrinsics, shared, self.config
-        )  # fmt: skip
+        static = self.pixels.predict(self._frame(source).z, pose, source, target)
+        return moved_evidence(self._frame(source), self._frame(target), static, shared, self.config)
 
     def _regions(self, frame: int, near: dict[int, Float32Array]) -> FrameDetections:
         evidence, weight = near[frame].copy(), self.config.neighbor_frames_weight

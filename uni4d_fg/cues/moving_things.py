@@ -79,20 +79,24 @@ class Placed:
 
 
 def place_moving(
-    contacts: tuple[Mapping[int, float], ...], sightings: Sightings, world_T_cam: FloatArray, intrinsics: FloatArray
+    contacts: tuple[Mapping[int, float], ...],
+    sightings: Sightings,
+    tracks: Tracks,
+    world_T_cam: FloatArray,
+    intrinsics: FloatArray,
 ) -> Placed:
     """Decide where things are.
 
     Args:
         contacts: T: inverse depth of the static surface at the lowest part of each thing, by id.
         sightings: Of all frames.
+        tracks: Those of the sightings, at the pixels of a pinhole that does not zoom.
         world_T_cam: (T, 4, 4).
         intrinsics: (4,) px.
     """
     placed = [dict(contact) for contact in contacts]
     nearer: dict[int, list[float]] = {}
     unknown = []
-    tracks = sightings.tracks
     for label in sorted(sightings.inside):
         mine = sightings.on(label)
         cut = float(np.mean(sightings.cut[label])) > _ON_IT

@@ -57,7 +57,12 @@ def predict_static(
 
 
 def predict_static_at(
-    u: AnyFloat, v: AnyFloat, z: AnyFloat, target_T_source: FloatArray, intrinsics: FloatArray
+    u: AnyFloat,
+    v: AnyFloat,
+    z: AnyFloat,
+    target_T_source: FloatArray,
+    intrinsics: FloatArray,
+    target_intrinsics: FloatArray | None = None,
 ) -> StaticPrediction:
     """Do what :func:`predict_static` does, from depth itself.
 
@@ -67,10 +72,13 @@ def predict_static_at(
         z: Depth.
         target_T_source: (4, 4) pose of the source camera in the target camera.
         intrinsics: (4,) fx, fy, cx, cy, px.
+        target_intrinsics: (4,) of the target, where the camera zooms; None for the same.
     """
     fx, fy, cx, cy = (np.float32(value) for value in intrinsics)
     rotation, shift = target_T_source[:3, :3].astype(np.float32), target_T_source[:3, 3].astype(np.float32)
     x, y = (u - cx) / fx, (v - cy) / fy
+    if target_intrinsics is not None:
+        fx, fy, cx, cy = (np.float32(value) for value in target_intrinsics)
     # The ray turned by R, times z, is also the derivative of the point by log z.
     ray = [(row[0] * x + row[1] * y + row[2]) * z for row in rotation]
     depth = np.maximum(ray[2] + shift[2], _NEAREST * z)

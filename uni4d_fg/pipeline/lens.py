@@ -34,6 +34,8 @@ class CameraModel:
     """(4,) px, of the longest focal length."""
     zoom: FloatArray | None = None
     """(T,) focal length of each frame over that one; None where the camera does not zoom."""
+    focal_sigma: float | None = None
+    """Standard deviation of the log focal length where camera motion told it with the rest; else None."""
 
     def apply(
         self, sequence: Sequence, labelled: LabelledTracks, config: Config
@@ -49,7 +51,7 @@ class CameraModel:
             ideal = unzoomed_tracks(ideal, self.intrinsics, np.log(self.zoom))
         held = config.input.model_copy(update={"intrinsics": "fixed"})
         return (
-            replace(sequence, intrinsics=self.intrinsics, focal_sigma=None, lens=PINHOLE),
+            replace(sequence, intrinsics=self.intrinsics, focal_sigma=self.focal_sigma, lens=PINHOLE, zoom=None),
             ideal,
             config.model_copy(update={"input": held}),
         )
@@ -58,11 +60,12 @@ class CameraModel:
 def is_sought(sequence: Video | Sequence, config: Config) -> bool:
     """Return whether the lens, or a zoom, is estimated.
 
-    That needs the likelihood of energy 'map', Levenberg-Marquardt, and poses and intrinsics that may move. A lens that
-    came with the sequence is taken as it is, unless a model is asked for.
+    That needs the likelihood of energy 'map', Levenberg-Marquardt, and poses and intrinsics that may move. A lens or a
+    zoom that came with the sequence is taken as it is, unless a model is asked for.
     """
     model, zooms = config.camera.model, config.camera.zoom == "on"
-    if (model == "pinhole" and not zooms) or (model == "auto" and not sequence.lens.is_pinhole):
+    known = not sequence.lens.is_pinhole or sequence.zoom is not None
+    if (model == "pinhole" and not zooms) or (model == "auto" and known):
         return False
     return _rules_it_out(config) is None
 
@@ -83,7 +86,8 @@ def _rules_it_out(config: Config) -> tuple[str, str] | None:
 def known_camera(sequence: Sequence, config: Config) -> CameraModel:
     """Return the camera of a sequence whose lens is not estimated. Raises ConfigError as :func:`check_camera`."""
     check_camera(sequence, config)
-    return CameraModel(PINHOLE if config.camera.model == "pinhole" else sequence.lens, sequence.intrinsics)
+    lens = PINHOLE if config.camera.model == "pinhole" else sequence.lens
+    return CameraModel(lens, sequence.intrinsics, sequence.zoom, sequence.focal_sigma)
 
 
 def check_camera(sequence: Video | Sequence, config: Config) -> None:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.structure.camera_search import find_camera
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import CONVERGED, grow
-from uni4d_fg.cues.structure.hypotheses import Competition
+from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
@@ -23,7 +25,7 @@ from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.track_model import Tracks
-from uni4d_fg.progress import Reporter
+from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -34,7 +36,9 @@ class Structure:
     world_T_cam: FloatArray
     """(T, 4, 4)."""
     intrinsics: FloatArray
-    """(4,) px."""
+    """(4,) px; those of :attr:`camera`."""
+    camera: MotionCamera
+    """What the pixels of the images are; errors, noise and focal lengths are those of its ideal pixels."""
     registered: BoolArray
     """(T,) False for frames that are bridged."""
     track: IntArray
@@ -77,6 +81,8 @@ def structure_from_motion(
     reporter: Reporter,
     should_stop: Callable[[], bool],
     with_doubts: bool = True,
+    camera: MotionCamera | None = None,
+    any_camera: bool = False,
 ) -> Structure | None:
     """Find cameras and static points from tracks.
 
@@ -89,6 +95,8 @@ def structure_from_motion(
         reporter: Told the steps, and the number of frames that have a pose.
         should_stop: Polled before every frame.
         with_doubts: Also look for what the tracks leave open; else there is one focal length and no rival.
+        camera: A lens or a zoom that is known; None for a pinhole.
+        any_camera: Also look for a lens and a zoom, as section ``camera`` says, where intrinsics are free.
 
     Returns:
         The structure, or None if no two frames have enough parallax to see depth.
@@ -101,25 +109,29 @@ def structure_from_motion(
     free_focal = config.input.intrinsics == "free"
     if should_stop():
         raise Cancelled("structure from motion stopped")
-    used = observations.select(spread_tracks(observations, image_size, settings.max_tracks))
-    outlier = epipolar_outliers(used, num_frames, image_size, settings)[used.rows()[1]]
-    competition = Competition(used, outlier, num_frames, image_size, intrinsics, config, free_focal, should_stop)
-    reporter.begin("starting views", None)
-    hypotheses = competition.run()
-    reporter.end()
-    if not hypotheses:
+    search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop)
+    if camera is None or camera.is_plain:
+        camera = MotionCamera(intrinsics)
+    observations = camera.ideal_observations(observations)
+    grown = search.grow(observations, camera.intrinsics, free_focal)
+    if grown is None:
         return None
-    best = hypotheses[0]
-    scene = GrowingScene.empty(
-        used.select(competition.chosen(best.tracks)), num_frames, best.scene.intrinsics, config,
-        free_focal=free_focal, prior_intrinsics=intrinsics, should_stop=should_stop,
-    )  # fmt: skip
-    scene.continue_from(best.scene)
-    grow(scene, reporter)
-    trim(scene)
+    if any_camera and free_focal:
+        reporter.begin("lens and zoom", None)
+        quiet = replace(search, reporter=SilentReporter())
+        found = find_camera(
+            grown.scene, observations, image_size, config,
+            lambda ideal, known: None if (new := quiet.grow(ideal, known, False)) is None else new.scene,
+        )  # fmt: skip
+        reporter.end()
+        if found is not None:
+            observations = found.ideal_observations(observations)
+            again = search.grow(observations, found.intrinsics, free_focal)
+            if again is None:
+                return None
+            grown, camera = again, found
+    scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)
-    scene.measure_noise()
-    scene.adjust(CONVERGED)
     sigma = scene.measure_noise()
     if with_doubts and only_turns(scene, scene.used()[0]):
         reporter.end()
@@ -145,9 +157,53 @@ def structure_from_motion(
     track, points, moving = _triangulate_all(observations, poses, scene)
     reporter.end()
     return Structure(
-        poses, scene.intrinsics, scene.registered, track, points, moving, sigma, best.pair, focal, focal_sigma,
-        best.unexplained, rivals,
+        poses, scene.intrinsics, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving,
+        sigma, best.pair, focal, focal_sigma, best.unexplained, rivals,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Grown:
+    scene: GrowingScene
+    hypotheses: list[Hypothesis]
+    """The best first."""
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What growing scenes of one video has in common."""
+
+    num_frames: int
+    image_size: tuple[int, int]
+    prior_intrinsics: FloatArray
+    config: Config
+    reporter: Reporter
+    should_stop: Callable[[], bool]
+
+    def grow(self, observations: Observations, intrinsics: FloatArray, free_focal: bool) -> _Grown | None:
+        """Let starts compete, and grow and trim the best; None if no two frames have parallax."""
+        settings = self.config.geometric_depth
+        used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
+        outlier = epipolar_outliers(used, self.num_frames, self.image_size, settings)[used.rows()[1]]
+        competition = Competition(
+            used, outlier, self.num_frames, self.image_size, intrinsics, self.config, free_focal, self.should_stop
+        )
+        self.reporter.begin("starting views", None)
+        hypotheses = competition.run()
+        self.reporter.end()
+        if not hypotheses:
+            return None
+        best = hypotheses[0]
+        scene = GrowingScene.empty(
+            used.select(competition.chosen(best.tracks)), self.num_frames, best.scene.intrinsics, self.config,
+            free_focal=free_focal, prior_intrinsics=self.prior_intrinsics, should_stop=self.should_stop,
+        )  # fmt: skip
+        scene.continue_from(best.scene)
+        grow(scene, self.reporter)
+        trim(scene)
+        scene.measure_noise()
+        scene.adjust(CONVERGED)
+        return _Grown(scene, hypotheses)
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:

@@ -215,6 +215,7 @@ def as_sequence(video: Video) -> Sequence:
         focal_sigma=video.focal_sigma,
         tracks=video.tracks,
         lens=video.lens,
+        zoom=video.zoom,
         ground_truth=video.ground_truth,
         content=video.content,
     )

@@ -106,6 +106,8 @@ class Video:
     """(4,) fx, fy, cx, cy in px."""
     lens: Lens = PINHOLE
     """What is known of its distortion; the pinhole where nothing is."""
+    zoom: FloatArray | None = None
+    """(T,) focal length of each frame over that of the intrinsics, at most 1, where it is known that it changes."""
     tracks: Tracks | None = None
     root: Path | None = None
     """Folder or file it was read from, if any."""
@@ -160,6 +162,8 @@ class Sequence:
     """Long 2D point tracks, when the sequence brings them."""
     lens: Lens = PINHOLE
     """What is known of its distortion; the pinhole where nothing is."""
+    zoom: FloatArray | None = None
+    """(T,) focal length of each frame over that of the intrinsics, at most 1, where it is known that it changes."""
     ground_truth: GroundTruth = field(default_factory=GroundTruth)
     content: Content | None = None
     """What lies between black bars; None where nobody has looked for any."""

@@ -1,0 +1,56 @@
+"""Where all pixels of small images would be seen in other frames of a static scene, through any camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import Float32Array, FloatArray
+from uni4d_fg.cues.static_scene import StaticPrediction, predict_static_at
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
+
+
+@dataclass(frozen=True)
+class PixelGrid:
+    """All pixels of images of one size."""
+
+    camera: MotionCamera
+    """Of that size."""
+    columns: Float32Array
+    """Of the pixels, or of the ideal ones of a lens, of a shape that NumPy broadcasts to (h, w)."""
+    rows: Float32Array
+
+    @classmethod
+    def of(cls, camera: MotionCamera, size: tuple[int, int], scale: FloatArray) -> PixelGrid:
+        """Return the grid of images of (h, w) ``size`` that are ``scale`` (2,) times those of the camera."""
+        (fx, fy, cx, cy), (sx, sy) = camera.intrinsics, scale
+        # Pixel centers are integers: (u + 1/2) scales.
+        intrinsics = np.array([fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5])
+        camera = replace(camera, intrinsics=intrinsics)
+        columns, rows = np.arange(size[1], dtype=np.float32), np.arange(size[0], dtype=np.float32)[:, None]
+        if camera.lens.is_pinhole:
+            return cls(camera, columns, rows)
+        pixels = np.stack(np.broadcast_arrays(columns, rows), axis=-1).astype(np.float64)
+        ideal = camera.lens.ideal_pixels(intrinsics, pixels).astype(np.float32)
+        return cls(camera, np.ascontiguousarray(ideal[..., 0]), np.ascontiguousarray(ideal[..., 1]))
+
+    def predict(self, z: Float32Array, target_T_source: FloatArray, source: int, target: int) -> StaticPrediction:
+        """Return where the pixels of a frame with depth z (h, w) are seen in another; NaN where no ray is known.
+
+        Derivatives are those of ideal pixels: what they weigh needs no more.
+        """
+        own, other = self._intrinsics(source), self._intrinsics(target)
+        static = predict_static_at(self.columns, self.rows, z, target_T_source, own, other)
+        if self.camera.lens.is_pinhole:
+            return static
+        ideal = np.stack([static.u, static.v], axis=-1).astype(np.float64)
+        real = self.camera.lens.real_pixels(self.camera.intrinsics, ideal).astype(np.float32)
+        return replace(static, u=real[..., 0], v=real[..., 1])
+
+    def _intrinsics(self, frame: int) -> FloatArray:
+        zoom = self.camera.zoom
+        if zoom is None:
+            return self.camera.intrinsics
+        ratio = np.exp(zoom[frame])
+        return np.asarray(self.camera.intrinsics * np.array([ratio, ratio, 1.0, 1.0]))

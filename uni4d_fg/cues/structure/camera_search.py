@@ -1,0 +1,354 @@
+r"""Whether the tracks of a grown scene ask for a lens, or for a focal length per frame, and which.
+
+A pinhole that was fitted to tracks of another camera is a minimum that two steps with little damping leave, as in
+:mod:`uni4d_fg.slam.lens`: on clips without a lens or zoom they take away 0.07 % of the reprojection energy by
+distortion and change a focal length per frame by 1 % at most, on others 0.6 % and 2.6 % at least. Only where more is
+found another camera is looked for.
+
+A lens bends the cameras little, so that its search starts from them, with several distortions undone.
+
+A zoom takes all cameras along: without it they end at several times the focal length. So they are grown anew, from
+tracks that do not zoom as far as a similarity tells: how much farther apart points are in the next frame. (Motion
+along the view does that, too; bundle adjustment with a focal length per frame then tells them apart.) The focal length
+is held at what was given until then, as it is what runs away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.cues.structure.first_pair import CommonTracks
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
+from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import INTRINSICS, OPENCV_CAMERA, POSE, ZOOM
+from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.lens.problems import RealPixels, lens_problem, zoom_problem
+from uni4d_fg.slam.stages.energy import MAP
+from uni4d_fg.slam.stages.observations import Observations
+
+Grown = Callable[[Observations, FloatArray], GrowingScene | None]
+"""Grows a scene from ideal observations, with intrinsics that are held."""
+
+_DAMPING = 1e-6
+"""Of the probe: the scale of a scene is held by a weak prior only, so that steps are not quite undamped."""
+_PROBED = 0.4
+"""Part of a zoom that the steps of the probe find, at least."""
+_MIN_LENS_EVIDENCE = 0.003
+"""Part of the reprojection energy that distortion must take away for a lens to be looked for."""
+_ZOOM_ROUNDS = 3
+_ZOOM_STEPS = 200
+_SETTLED = 0.003
+"""Change of the log zoom in a round below which it is found."""
+_FAR_APART = 0.1
+"""Points nearer to each other than this part of the image's diagonal say little of a similarity."""
+_PAIRS = 4000
+_LOST = 50.0
+"""Errors, in sigmas, are cut here: what a camera does not explain counts as much."""
+_FAR = 3.0
+"""A parameter farther from zero than so many sigmas of its prior is no lens."""
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A camera that was fitted, and the poses that go with it."""
+
+    camera: MotionCamera
+    scene: GrowingScene
+    evidence: float = 0.0
+    """Part of the reprojection energy that setting the camera free took away."""
+
+
+def find_camera(
+    scene: GrowingScene, real: Observations, image_size: tuple[int, int], config: Config, grown: Grown
+) -> MotionCamera | None:
+    """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom.
+
+    Args:
+        scene: Grown with such a pinhole.
+        real: All observations, as the images show them.
+        image_size: (height, width), px.
+        config: Section ``camera``: which cameras to look for.
+        grown: Grows a scene with another camera.
+
+    Raises:
+        Cancelled: If asked to stop.
+        SolverError: If bundle adjustment fails.
+    """
+    settings = config.camera
+    part = _part_of(scene, settings.observations)
+    plain = _Fitted(MotionCamera(part.intrinsics), part)
+    asks_for_zoom = settings.zoom == "auto" and _asks_for_zoom(plain, config)
+    asks_for_lens = settings.model == "auto" and (
+        _joint(plain, "SIMPLE_RADIAL", config, _probing(config)).evidence >= _MIN_LENS_EVIDENCE
+    )
+    if not (asks_for_zoom or asks_for_lens):
+        return None
+    judge = _Judge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
+    best = plain
+    if asks_for_lens:
+        lens = _find_lens(plain, judge, config)
+        if _is_lens(lens.camera, image_size, config) and judge.better(lens, plain)[0] > 0.0:
+            best = lens
+    if asks_for_zoom:
+        zoom = _find_zoom(scene, real, image_size, config, grown)
+        if zoom is not None and _is_zoom(zoom.camera, config):
+            agree = judge.better(zoom, plain)[1]
+            if agree >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0:
+                best = zoom
+    return None if best is plain else best.camera
+
+
+def _part_of(scene: GrowingScene, observations: int) -> GrowingScene:
+    """Return the scene with evenly spread tracks that have about so many observations together."""
+    return _scene_of(scene.observations.select(scene.observations.thinned(observations)), scene)
+
+
+def _scene_of(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
+    """Return a scene of other observations with the cameras of one that is grown, trimmed."""
+    scene = GrowingScene.empty(
+        ideal.with_min_observations(2), len(cameras.registered), cameras.intrinsics, cameras.config,
+        free_focal=cameras.free_focal, prior_intrinsics=cameras.prior_intrinsics, should_stop=cameras.should_stop,
+    )  # fmt: skip
+    scene.continue_from(cameras)
+    trim(scene)
+    scene.measure_noise()
+    return scene
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Compares cameras by tracks that are triangulated anew."""
+
+    real: Observations
+    """As the images show them."""
+    sigma_px: float
+
+    def energies(self, fitted: _Fitted) -> FloatArray:
+        """Return the mean robust energy (K,) of each track on real pixels; NaN where its rays are too parallel."""
+        tracks, row = self.real.rows()
+        ideal = fitted.camera.ideal_observations(self.real)
+        cameras = fitted.scene
+        scene = GrowingScene.empty(
+            ideal.with_min_observations(2), len(cameras.registered), cameras.intrinsics, cameras.config,
+            free_focal=False, prior_intrinsics=cameras.prior_intrinsics, should_stop=cameras.should_stop,
+        )  # fmt: skip
+        scene.continue_from(cameras)
+        seen = scene.observations
+        size = fitted.camera.ideal_weight(seen.uv, seen.frame)
+        error = np.minimum(scene.errors() * np.sqrt(size) / self.sigma_px, _LOST)
+        row = np.searchsorted(tracks, seen.track)
+        count = np.bincount(row, minlength=len(tracks))
+        known = np.isin(tracks, seen.track[np.isfinite(scene.position[scene.row, 0])])
+        energy = np.bincount(row, np.log1p(error**2), len(tracks)) / np.maximum(count, 1)
+        return np.where(known, energy, np.nan)
+
+    def better(self, fitted: _Fitted, rival: _Fitted) -> tuple[float, float]:
+        """Return by which part a camera lowers the energy of the tracks that both have a point of, and of how many."""
+        ours, theirs = self.energies(fitted), self.energies(rival)
+        known = np.isfinite(ours) & np.isfinite(theirs)
+        if not known.any():
+            return 0.0, 0.0
+        ours, theirs = ours[known], theirs[known]
+        return 1.0 - float(ours.sum() / max(theirs.sum(), 1e-300)), float(np.mean(ours < theirs))
+
+
+def _asks_for_zoom(plain: _Fitted, config: Config) -> bool:
+    probe = _free_zoom(plain, config, _probing(config))
+    assert probe.camera.zoom is not None
+    settings = config.camera
+    moves = float(np.ptp(probe.camera.zoom)) >= _PROBED * settings.min_zoom
+    return probe.evidence >= settings.min_zoom_evidence and moves
+
+
+def _is_zoom(camera: MotionCamera, config: Config) -> bool:
+    assert camera.zoom is not None
+    return float(np.expm1(np.ptp(camera.zoom))) >= config.camera.min_zoom
+
+
+def _is_lens(camera: MotionCamera, image_size: tuple[int, int], config: Config) -> bool:
+    settings, lens = config.camera, camera.lens
+    if max(map(abs, lens.parameters)) > _FAR * settings.parameter_prior_sigma:
+        return False
+    return settings.min_displacement_px < lens.displacement(camera.intrinsics, image_size) < np.inf
+
+
+def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
+    """Fit one radial parameter from the best of several starts, and a second one where that takes energy away."""
+    starts = []
+    for k1 in config.camera.starts:
+        camera = MotionCamera(plain.camera.intrinsics, Lens("SIMPLE_RADIAL", (k1,)))
+        scene = _scene_of(camera.ideal_observations(judge.real), plain.scene)
+        scene.adjust()
+        scene.triangulate_all()
+        scene.adjust()
+        starts.append(_Fitted(camera.with_intrinsics(scene.intrinsics), scene))
+    found = starts[0]
+    for start in starts[1:]:
+        if judge.better(start, found)[0] > 0.0:
+            found = start
+    settings = config.camera
+    to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
+    models: tuple[LensModel, ...] = ("SIMPLE_RADIAL", "RADIAL")
+    for model in models:
+        richer = _joint(found, model, config, to_the_end)
+        if model == "RADIAL" and richer.evidence < settings.min_further_evidence:
+            break
+        scene = _scene_of(richer.camera.ideal_observations(judge.real), richer.scene)
+        found = replace(richer, scene=scene)
+    return found
+
+
+def _joint(start: _Fitted, model: LensModel, config: Config, options: dict[str, float]) -> _Fitted:
+    """Free the intrinsics, and then the parameters of a lens as well; the evidence is what the second takes away."""
+    bundle = _Bundle.of(start)
+    camera = np.concatenate([start.scene.intrinsics, start.camera.lens.padded])
+    problem, state = lens_problem(
+        bundle.state, bundle.stage.problem.batches, bundle.real(start), camera, model, start.scene.prior_intrinsics,
+        config.bundle_adjustment, config.camera,
+    )  # fmt: skip
+    pixel = [] if config.bundle_adjustment.free_principal_point else [2, 3]
+    solver = bundle.stage.solver.model_copy(update=options)
+    unused = range(4 + len(PARAMETERS[model]), 8)
+    known = range(4 if model == "SIMPLE_RADIAL" else 5, 8)
+    stop = start.scene.should_stop
+    state, before = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *known]), state, solver, stop)
+    state, after = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *unused]), state, solver, stop)
+    found = state[OPENCV_CAMERA][0]
+    evidence = (before.final_energy - after.final_energy) / max(before.final_energies["static_reprojection"], 1e-300)
+    scene = bundle.moved(start.scene, state, found[:4])
+    return _Fitted(MotionCamera(scene.intrinsics, Lens.of(model, found[4:])), scene, evidence)
+
+
+def _find_zoom(
+    scene: GrowingScene, real: Observations, image_size: tuple[int, int], config: Config, grown: Grown
+) -> _Fitted | None:
+    """Grow scenes from tracks whose zoom is undone, and free what is left of it; None if none grows."""
+    log_ratio = similarities(scene.observations, len(scene.registered), image_size)
+    camera = MotionCamera(scene.prior_intrinsics, zoom=log_ratio - log_ratio.max())
+    settings = config.camera
+    to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": _ZOOM_STEPS}
+    found = None
+    for _ in range(_ZOOM_ROUNDS):
+        start = grown(camera.ideal_observations(real), camera.intrinsics)
+        if start is None:
+            return found
+        part = _part_of(start, settings.observations)
+        part.free_focal = scene.free_focal
+        found = _free_zoom(_Fitted(camera, part), config, to_the_end)
+        assert camera.zoom is not None
+        assert found.camera.zoom is not None
+        settled = float(np.ptp(found.camera.zoom - camera.zoom)) < _SETTLED
+        camera = found.camera
+        if settled:
+            break
+    return found
+
+
+def similarities(observations: Observations, num_frames: int, image_size: tuple[int, int]) -> FloatArray:
+    """Return by how much, in logarithms, what is seen grows from the first frame on (T,), as a similarity tells."""
+    common = CommonTracks(observations, num_frames)
+    far = _FAR_APART * float(np.hypot(*image_size))
+    out = np.zeros(num_frames)
+    rng = np.random.default_rng(0)
+    for frame in range(1, num_frames):
+        before, after = (observations.uv[rows] for rows in common.between(frame - 1, frame))
+        step = 0.0
+        if len(before):
+            one, other = rng.integers(len(before), size=(2, _PAIRS))
+            apart = np.linalg.norm(before[one] - before[other], axis=1)
+            known = apart > far
+            if known.any():
+                later = np.linalg.norm(after[one] - after[other], axis=1)
+                step = float(np.median(np.log(np.maximum(later[known], 1e-9) / apart[known])))
+        out[frame] = out[frame - 1] + step
+    return out
+
+
+def _free_zoom(start: _Fitted, config: Config, options: dict[str, float]) -> _Fitted:
+    """Free a focal length per frame, beside that which was undone."""
+    bundle = _Bundle.of(start)
+    problem, state = zoom_problem(
+        bundle.state, bundle.stage.problem.batches, bundle.ideal, bundle.frames, config.bundle_adjustment, config.camera
+    )
+    before = problem.energies(state)["static_reprojection"]
+    solver = bundle.stage.solver.model_copy(update=options)
+    state, after = _solve(problem, state, solver, start.scene.should_stop)
+    every = np.arange(len(start.scene.registered))
+    zoom = np.interp(every, bundle.frames, state[ZOOM][:, 0])
+    zoom = zoom if start.camera.zoom is None else zoom + start.camera.zoom
+    intrinsics = state[INTRINSICS][0].copy()
+    longest = float(zoom.max())
+    intrinsics[:2] *= np.exp(longest)
+    evidence = (after.initial_energy - after.final_energy) / max(before, 1e-300)
+    scene = bundle.moved(start.scene, state, intrinsics)
+    return _Fitted(MotionCamera(intrinsics, zoom=zoom - longest), scene, evidence)
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """Bundle adjustment of a scene, and its observations with the rows of poses and landmarks."""
+
+    stage: Stage
+    state: State
+    frames: IntArray
+    """(F,) that have a pose."""
+    ideal: RealPixels
+    """Observations at ideal pixels."""
+
+    @classmethod
+    def of(cls, fitted: _Fitted) -> _Bundle:
+        scene = fitted.scene
+        stage, state, frames, _ = scene.bundle()
+        used, row = scene.used()
+        _, row = np.unique(row, return_inverse=True)
+        sigma = scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px
+        return cls(stage, state, frames, cls._pixels(scene, used, used.weight, row, frames, sigma))
+
+    @staticmethod
+    def _pixels(
+        scene: GrowingScene, used: Observations, weight: FloatArray, row: IntArray, frames: IntArray, sigma: float
+    ) -> RealPixels:
+        frame = np.searchsorted(frames, used.frame)
+        kernel = scene.config.bundle_adjustment.reprojection_kernel
+        return RealPixels(frame, row, used.uv, MAP.observed(sigma, weight, kernel, frame, len(frames)))
+
+    def real(self, fitted: _Fitted) -> RealPixels:
+        """Return the observations as the images show them."""
+        scene, camera = fitted.scene, fitted.camera
+        used, _ = scene.used()
+        weight = used.weight / camera.ideal_weight(used.uv, used.frame)
+        sigma = scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px
+        real = replace(used, uv=camera.real(used.uv, used.frame))
+        return self._pixels(scene, real, weight, self.ideal.row, self.frames, sigma)
+
+    def moved(self, scene: GrowingScene, state: State, intrinsics: FloatArray) -> GrowingScene:
+        """Return a scene with the cameras of a state; its points are those of before."""
+        poses = scene.world_T_cam.copy()
+        poses[self.frames] = state[POSE]
+        return replace(scene, world_T_cam=poses, intrinsics=intrinsics.copy())
+
+
+def _probing(config: Config) -> dict[str, float]:
+    return {"max_iterations": config.camera.probe_steps, "initial_damping": _DAMPING, "relative_decrease": 0.0}
+
+
+def _solve(
+    problem: Problem, state: State, solver: SolverConfig, should_stop: Callable[[], bool]
+) -> tuple[State, SolveSummary]:
+    state, summary = run_stage(Stage("camera", problem, solver), state, Hooks(should_stop=should_stop))
+    if summary.termination is Termination.CANCELLED:
+        raise Cancelled("structure from motion stopped")
+    return state, summary
