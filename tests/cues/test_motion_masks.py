@@ -17,7 +17,9 @@ from uni4d_fg.cues.guided_filter import guided_filter
 from uni4d_fg.cues.motion_masks import MotionMasks, motion_masks
 from uni4d_fg.cues.moving_regions import trusted_components
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
+from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.track_motion import Cameras, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
@@ -125,12 +127,14 @@ def test_evidence_of_pixels(rng: np.random.Generator) -> None:
     near = np.full((120, 160), 2.0, np.float32)
     near[20:60, 100:140] = 1.0  # something else in front
     zero = np.zeros((120, 160), np.float32)
+    pixels = PixelGrid.of(MotionCamera(INTRINSICS), (120, 160), np.ones(2))
 
     def evidence(second: np.ndarray, depth: np.ndarray, pose: np.ndarray, edge_px: int = 1) -> np.ndarray:
         first, other = (
             frame_appearance(i, d, 0.0, edge_px, MotionMaskConfig()) for i, d in ((image, depth), (second, near))
         )
-        return moved_evidence(first, other, pose, INTRINSICS, (zero, zero), MotionMaskConfig())
+        static = pixels.predict(first.z, pose, 0, 1)
+        return moved_evidence(first, other, static, (zero, zero), MotionMaskConfig())
 
     far = np.full((120, 160), 2.0, np.float32)
     found = evidence(after, far, np.eye(4))

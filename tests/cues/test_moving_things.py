@@ -115,7 +115,7 @@ def test_a_thing_that_floats_is_put_nearer_than_what_is_below_it() -> None:
     middle = thing(speed_z=-0.2)
     tracks = seen(middle, centers, 0.1)
     contacts = tuple({3: 0.2} for _ in range(FRAMES))
-    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), poses(centers), INTRINSICS)
+    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS)
     z = 1 / np.array([values[3] for values in placed.inverse_depth])
     np.testing.assert_allclose(z, (middle - centers)[:, 2], rtol=0.12)
     assert placed.nearer[3] == pytest.approx(2.7, rel=0.1)
@@ -126,11 +126,11 @@ def test_without_shake_it_stays_where_it_may_stand_and_a_thing_that_is_cut_off_i
     centers = camera(0.0)
     tracks = seen(thing(), centers, 0.1)
     contacts = tuple({3: 0.2} for _ in range(FRAMES))
-    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), poses(centers), INTRINSICS)
+    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS)
     np.testing.assert_allclose([values[3] for values in placed.inverse_depth], 0.2, rtol=1e-3)
     assert not placed.nearer
     assert not placed.open
-    cut = place_moving(contacts, sightings(tracks, slice(0, 240)), poses(centers), INTRINSICS)
+    cut = place_moving(contacts, sightings(tracks, slice(0, 240)), tracks, poses(centers), INTRINSICS)
     assert cut.open == [3]
 
 
@@ -141,5 +141,5 @@ def test_things_without_tracks_and_frames_without_things_are_left_alone() -> Non
         mask = np.zeros(SIZE, dtype=np.int32)
         mask[50:60] = 2 * (frame > 0)
         found.add(frame, mask)
-    placed = place_moving(({}, {2: 0.3}, {2: 0.4}), found, np.tile(np.eye(4), (3, 1, 1)), INTRINSICS)
+    placed = place_moving(({}, {2: 0.3}, {2: 0.4}), found, nothing, np.tile(np.eye(4), (3, 1, 1)), INTRINSICS)
     assert placed.inverse_depth == ({}, {2: 0.3}, {2: 0.4})

@@ -60,7 +60,7 @@ class CueFiles:
             changes["tracks"] = load_track_file(self.tracks, count).to_tracks(count, size)
         if self.intrinsics is not None:
             calibration = load_calibration(self.intrinsics, count, size)
-            changes |= {"intrinsics": calibration.intrinsics, "lens": calibration.lens}
+            changes |= {"intrinsics": calibration.intrinsics, "lens": calibration.lens, "zoom": None}
         return replace(video, **changes)
 
     def __bool__(self) -> bool:

@@ -55,6 +55,8 @@ def sequence_digest(sequence: Sequence, should_stop: Callable[[], bool] | None =
     if not sequence.lens.is_pinhole:
         digest.update(sequence.lens.model.encode())
         add_array(digest, sequence.lens.padded)
+    if sequence.zoom is not None:
+        add_array(digest, sequence.zoom)
     add_array(digest, sequence.timestamps)
     if sequence.initial_world_T_cam is not None:
         add_array(digest, sequence.initial_world_T_cam)

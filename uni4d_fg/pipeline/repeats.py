@@ -54,6 +54,7 @@ class Repeats:
             timestamps=sequence.timestamps[self.solved],
             frame_names=tuple(sequence.frame_names[t] for t in self.solved) if sequence.frame_names else (),
             initial_world_T_cam=None if poses is None else poses[self.solved],
+            zoom=None if sequence.zoom is None else sequence.zoom[self.solved],
             tracks=None,
             ground_truth=type(sequence.ground_truth)(),
         )

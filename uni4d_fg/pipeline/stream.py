@@ -13,7 +13,7 @@ import numpy as np
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.errors import Cancelled, ConfigError
 from uni4d_fg.files import atomic_write_json, atomic_write_text, remove_file
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.naming import order_warnings
@@ -100,6 +100,8 @@ def check_stream(sequence: Sequence, config: Config) -> None:
     """
     check_sequence(sequence)
     check_parameters(sequence, config, "in a stream", "find it with `uni4d-fg reconstruct`")
+    if sequence.zoom is not None:
+        raise ConfigError("a stream has one focal length, and this camera zooms; use `uni4d-fg reconstruct`")
     check_incremental(config)
 
 

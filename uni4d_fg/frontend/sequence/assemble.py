@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
+from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npz
 from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, load_intrinsics
 from uni4d_fg.frontend.sequence.decode import check_bit_depth
@@ -20,6 +21,7 @@ from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.selection import MIN_FRAMES
 from uni4d_fg.frontend.sequence.track_files import RawTracks, load_native_tracks, load_uni4d_tracks
 from uni4d_fg.frontend.sequence.video import VideoFrames
+from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.reading import read_json
 
 
@@ -128,14 +130,18 @@ class DepthNote(NamedTuple):
     """See :attr:`~uni4d_fg.frontend.sequence.model.Video.depth_parallax`."""
     focal_sigma: float | None = None
     """See :attr:`~uni4d_fg.frontend.sequence.model.Video.focal_sigma`."""
+    lens: Lens = PINHOLE
+    """Found with the intrinsics."""
+    zoom: FloatArray | None = None
+    """See :attr:`~uni4d_fg.frontend.sequence.model.Video.zoom`."""
 
 
-def load_depth_note(path: Path) -> DepthNote:
+def load_depth_note(path: Path, num_frames: int) -> DepthNote:
     """Return what the file says.
 
     Raises:
-        InputError: If it does not say whether depth is in meters, of which kind the motion was that it is from, or
-            how well that told the focal length.
+        InputError: If it does not say whether depth is in meters, of which kind the motion was that it is from,
+            how well that told the focal length, or which camera was found with it.
     """
     note = read_json(path)
     if not isinstance(note, dict) or not isinstance(note.get("metric"), bool):
@@ -156,7 +162,28 @@ def load_depth_note(path: Path) -> DepthNote:
             'write "focal_sigma" as a number that is not negative, or leave it out',
         )  # fmt: skip
     parallax = None if motion is None else motion["parallax"]
-    return DepthNote(note["metric"], parallax, None if sigma is None else float(sigma))
+    lens, zoom = _noted_camera(note.get("camera"), path, num_frames)
+    return DepthNote(note["metric"], parallax, None if sigma is None else float(sigma), lens, zoom)
+
+
+def _noted_camera(note: Any, path: Path, num_frames: int) -> tuple[Lens, FloatArray | None]:
+    """Return the lens and the zoom (T,) of a depth note."""
+    if note is None:
+        return PINHOLE, None
+    try:
+        lens = Lens(note["model"], tuple(float(value) for value in note["parameters"]))
+        zoom = None if note.get("zoom") is None else np.array(note["zoom"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, AttributeError, InputError) as error:
+        raise SequenceProblem(
+            path, f"does not say what the camera is ({error})",
+            'write "camera": {"model": "RADIAL", "parameters": [k1, k2], "zoom": null}, or leave it out',
+        ) from error  # fmt: skip
+    if zoom is not None and not (zoom.shape == (num_frames,) and (zoom > 0.0).all() and (zoom <= 1.0).all()):
+        raise SequenceProblem(
+            path, f"has a zoom that is not {num_frames} numbers above 0 and at most 1",
+            "write the focal length of each frame over the longest, or null",
+        )  # fmt: skip
+    return lens, zoom
 
 
 def frame_names(images: ImageFolder | VideoFrames) -> tuple[str, ...]:
@@ -256,7 +283,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
     if files.tracks is not None:
         tracks = load_tracks(files, files.tracks, num_frames).to_tracks(num_frames, size)
     root = files.root.resolve()
-    note = DepthNote() if files.depth_note is None else load_depth_note(files.depth_note)
+    note = DepthNote() if files.depth_note is None else load_depth_note(files.depth_note, num_frames)
     return Video(
         name=root.stem if root.is_file() else root.name,
         images=images,
@@ -268,6 +295,8 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
         depth_is_metric=note.metric,
         depth_parallax=note.parallax,
         focal_sigma=note.focal_sigma,
+        lens=note.lens,
+        zoom=note.zoom,
         masks=masks,
         intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
         tracks=tracks,

@@ -93,6 +93,7 @@ def _take(video: Video, frames: IntArray) -> Video:
         tracks=tracks,
         frame_names=tuple(video.frame_names[frame] for frame in frames) if video.frame_names else (),
         initial_world_T_cam=_of_poses(video.initial_world_T_cam, frames),
+        zoom=None if video.zoom is None else video.zoom[frames],
         ground_truth=GroundTruth(
             world_T_cam=_of_poses(truth.world_T_cam, frames),
             depths=None if truth.depths is None else SelectedFrames(truth.depths, frames),

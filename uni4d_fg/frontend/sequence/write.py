@@ -87,6 +87,9 @@ def _write_cues(sequence: Sequence, folder: Path, names: tuple[str, ...]) -> Non
         note["from_motion"] = {"parallax": sequence.depth_parallax}
     if sequence.focal_sigma is not None:
         note["focal_sigma"] = sequence.focal_sigma
+    if not sequence.lens.is_pinhole or sequence.zoom is not None:
+        zoom = None if sequence.zoom is None else sequence.zoom.tolist()
+        note["camera"] = {"model": sequence.lens.model, "parameters": sequence.lens.parameters, "zoom": zoom}
     if note != {"metric": True}:
         (folder / DEPTH_NOTE).write_text(json.dumps(note) + "\n", encoding="utf-8")
     _write_masks(sequence.masks, folder / "masks", names, always_rgb=False)

@@ -1,0 +1,179 @@
+"""Lens and zoom from tracks alone, and the camera that they make."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, tracked
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.pixel_grid import PixelGrid
+from uni4d_fg.cues.structure.camera_search import similarities
+from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.cues.structure.motion_camera import MotionCamera
+from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.geometry.camera import project, unproject, world_to_camera
+from uni4d_fg.geometry.lens import Lens
+from uni4d_fg.geometry.se3 import inverse, so3_exp
+from uni4d_fg.progress import SilentReporter
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+
+FRAMES = 20
+
+
+def through(scene: TrackedScene, camera: MotionCamera) -> TrackedScene:
+    """Return the observations of a scene as another camera has them, as far as they are in its image."""
+    seen = scene.observations
+    uv = camera.real(seen.uv, seen.frame)
+    height, width = SIZE
+    inside = (uv >= 0).all(axis=1) & (uv <= [width - 1, height - 1]).all(axis=1)
+    return replace(scene, observations=replace(seen, uv=uv).select(inside).with_min_observations(2))
+
+
+def ramp(ratio: float) -> np.ndarray:
+    """Return the log zoom of the frames, (T,), from one end to the other; the longest is 0."""
+    log = np.linspace(0.0, np.log(ratio), FRAMES)
+    return log - log.max()
+
+
+def structure(scene: TrackedScene, *changes: str) -> Structure:
+    found = structure_from_motion(
+        scene.observations, FRAMES, SIZE, GUESS, load_config("default", list(changes)), SilentReporter(),
+        lambda: False, any_camera=True,
+    )  # fmt: skip
+    assert found is not None
+    return found
+
+
+def path_error(found: Structure, scene: TrackedScene) -> float:
+    extent = np.linalg.norm(np.ptp(scene.world_T_cam[:, :3, 3], axis=0))
+    return evaluate_trajectory(found.world_T_cam, scene.world_T_cam).ate_m / float(extent)
+
+
+@pytest.mark.parametrize(
+    "k1", [pytest.param(-0.25, marks=pytest.mark.slow), -0.12, pytest.param(0.1, marks=pytest.mark.slow)]
+)
+def test_a_lens_is_found_from_tracks_alone(k1: float) -> None:
+    scene = through(tracked(sideways(FRAMES), points=1500), MotionCamera(K, Lens("SIMPLE_RADIAL", (k1,))))
+    found = structure(scene)
+    assert found.camera.lens.parameters[0] == pytest.approx(k1, abs=0.02)
+    assert found.camera.zoom is None
+    np.testing.assert_allclose(found.intrinsics[:2], K[:2], rtol=0.02)
+    np.testing.assert_array_equal(found.intrinsics, found.camera.intrinsics)
+    assert path_error(found, scene) < 0.004
+    pinhole = structure(scene, "camera.model=pinhole")
+    assert pinhole.camera.is_plain
+    assert path_error(pinhole, scene) > 1.4 * path_error(found, scene)
+
+
+@pytest.mark.parametrize("ratio", [1.6, pytest.param(0.6, marks=pytest.mark.slow)])
+def test_a_zoom_is_found_from_tracks_alone(ratio: float) -> None:
+    wide = K * np.array([1.2, 1.2, 1.0, 1.0])
+    plain = tracked(sideways(FRAMES), points=1500)
+    # Tracks of K, as a camera would have them whose longest focal length is 1.2 times K's.
+    uv = K[2:] + (plain.observations.uv - K[2:]) * wide[:2] / K[:2]
+    zoom = ramp(ratio)
+    scene = through(replace(plain, observations=replace(plain.observations, uv=uv)), MotionCamera(wide, zoom=zoom))
+    found = structure(scene)
+    assert found.camera.zoom is not None
+    assert found.camera.lens.is_pinhole
+    np.testing.assert_allclose(found.intrinsics[0] * np.exp(found.camera.zoom), wide[0] * np.exp(zoom), rtol=0.03)
+    assert path_error(found, scene) < 0.004
+    off = structure(scene, "camera.zoom=off", "camera.model=pinhole")
+    assert path_error(off, scene) > 5 * path_error(found, scene)
+
+
+@pytest.mark.parametrize(("path", "moving"), [(sideways, 0), (sideways, 150), (forward, 0)])
+def test_a_pinhole_that_does_not_zoom_is_left_one(path, moving: int) -> None:  # type: ignore[no-untyped-def]
+    scene = tracked(path(FRAMES), points=1500, moving=moving)
+    assert structure(scene).camera.is_plain
+
+
+def test_a_camera_that_is_known_is_not_looked_for() -> None:
+    lens = Lens("SIMPLE_RADIAL", (-0.2,))
+    scene = through(tracked(sideways(FRAMES)), MotionCamera(K, lens))
+    found = structure_from_motion(
+        scene.observations, FRAMES, SIZE, K, load_config("default", ["input.intrinsics=fixed"]), SilentReporter(),
+        lambda: False, camera=MotionCamera(K, lens),
+    )  # fmt: skip
+    assert found is not None
+    assert found.camera.lens == lens
+    np.testing.assert_array_equal(found.intrinsics, K)
+    assert path_error(found, scene) < 0.004
+
+
+def test_a_similarity_tells_a_zoom_of_a_camera_that_only_turns() -> None:
+    turning = sideways(FRAMES)
+    turning[:, :3, 3] = 0.0
+    scene = through(tracked(turning, noise_px=0.1), MotionCamera(K, zoom=ramp(1.6)))
+    np.testing.assert_allclose(
+        similarities(scene.observations, FRAMES, SIZE), np.linspace(0, np.log(1.6), 20), atol=0.02
+    )
+
+
+CAMERAS = st.one_of(
+    st.builds(lambda k: MotionCamera(K, Lens("SIMPLE_RADIAL", (k,))), st.floats(-0.2, 0.3)),
+    st.builds(lambda k, m: MotionCamera(K, Lens("RADIAL", (k, m))), st.floats(-0.1, 0.2), st.floats(-0.05, 0.1)),
+    st.builds(lambda ratio: MotionCamera(K, zoom=ramp(ratio)), st.floats(0.5, 2.0)),
+    st.just(MotionCamera(K)),
+)
+PIXELS = np.array([[0.0, 0.0], [319.0, 239.0], [40.0, 200.0], [159.5, 119.5], [300.0, 10.0]])
+
+
+@given(CAMERAS, st.floats(0.6, 1.7))
+@settings(max_examples=40, deadline=None)
+def test_ideal_pixels_and_back(camera: MotionCamera, ratio: float) -> None:
+    frame = np.arange(5)
+    ideal = camera.ideal(PIXELS, frame)
+    np.testing.assert_allclose(camera.real(ideal, frame), PIXELS, atol=1e-6)
+    other = camera.with_intrinsics(K * np.array([ratio, ratio, 1.0, 1.0]))
+    np.testing.assert_allclose(other.ideal(PIXELS, frame), ideal, atol=1e-6)
+    again = MotionCamera.of_array(camera.to_array(), camera.intrinsics)
+    np.testing.assert_array_equal(again.ideal(PIXELS, frame), ideal)
+    # A weight is the area that a small square around the ideal pixel has in the image.
+    step = 1e-4
+    across, down = (camera.real(ideal + np.array(d) * step, frame) - PIXELS for d in ([1, 0], [0, 1]))
+    area = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]) / step**2
+    np.testing.assert_allclose(camera.ideal_weight(ideal, frame), np.minimum(area, 1.0), rtol=2e-3)
+
+
+def test_tracks_keep_what_is_not_seen() -> None:
+    uv = np.tile(PIXELS[:, None].astype(np.float32), (1, 2, 1))
+    visible = np.ones((5, 2), dtype=bool)
+    visible[3, 1] = False
+    uv[3, 1] = np.nan
+    tracks = Tracks(uv, visible, np.zeros(5, dtype=np.int32))
+    camera = MotionCamera(K, Lens("SIMPLE_RADIAL", (-0.2,)))
+    moved = camera.ideal_tracks(tracks)
+    np.testing.assert_array_equal(moved.visible, visible)
+    np.testing.assert_allclose(moved.uv[:, 0], camera.ideal(PIXELS, np.zeros(5, dtype=np.int64)), rtol=1e-6)
+    assert np.isnan(moved.uv[3, 1]).all()
+    np.testing.assert_array_equal(tracks.uv[:, 0], PIXELS.astype(np.float32))
+    assert MotionCamera(K).ideal_tracks(tracks) is tracks
+
+
+@pytest.mark.parametrize(
+    "camera", [MotionCamera(K), MotionCamera(K, Lens("SIMPLE_RADIAL", (-0.2,))), MotionCamera(K, zoom=ramp(1.6))]
+)
+def test_pixels_of_a_static_scene_in_another_frame(camera: MotionCamera) -> None:
+    """Against each pixel's ray through the camera, moved and projected, at half the size."""
+    height, width = 120, 160
+    scale = np.array([0.5, 0.5])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = so3_exp(np.array([0.02, -0.05, 0.03])), [0.2, -0.1, 0.15]
+    z = np.full((height, width), 2.5, np.float32)
+    z[40:80, 50:90] = 1.5
+    static = PixelGrid.of(camera, (height, width), scale).predict(z, pose, 3, 11)
+    rows, columns = np.mgrid[0:height, 0:width]
+    small = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
+    full = (small + 0.5) / scale - 0.5
+    source, target = np.full(len(full), 3), np.full(len(full), 11)
+    point = unproject(K, camera.ideal(full, source), z.reshape(-1).astype(np.float64))
+    there = camera.real(np.asarray(project(K, world_to_camera(inverse(pose), point))), target)
+    expected = (there + 0.5) * scale - 0.5
+    found = np.stack([np.broadcast_to(static.u, z.shape), np.broadcast_to(static.v, z.shape)], axis=-1).reshape(-1, 2)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
