@@ -125,11 +125,10 @@ def structure_from_motion(
         )  # fmt: skip
         reporter.end()
         if found is not None:
-            observations = found.ideal_observations(observations)
-            again = search.grow(observations, found.intrinsics, free_focal)
-            if again is None:
-                return None
-            grown, camera = again, found
+            ideal = found.ideal_observations(observations)
+            again = search.grow(ideal, found.intrinsics, free_focal)
+            if again is not None:
+                grown, camera, observations = again, found, ideal
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)
     sigma = scene.measure_noise()
