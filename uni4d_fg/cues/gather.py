@@ -232,8 +232,8 @@ class _Gathering:
 
         def from_motion(intrinsics: FloatArray) -> GeometricDepth:
             return geometric_depth(
-                masked, tracks, static, intrinsics, self.camera, self._key(), self.folder, config, self.reporter,
-                self.should_stop,
+                masked, tracks, static, intrinsics, self._known_camera(), self._key(), self.folder, config,
+                self.reporter, self.should_stop,
             )  # fmt: skip
 
         found = from_motion(self._start_intrinsics())
@@ -273,6 +273,16 @@ class _Gathering:
         self.report.facts += [f"masks: {fact}" for fact in facts]
         self.report.warnings += warnings
         return masks
+
+    def _known_camera(self) -> MotionCamera | None:
+        """Return a lens or a zoom that needs not be looked for; None lets the tracks tell.
+
+        A lens that was found among things that move is looked for again once they are masked: they can mimic one. A
+        zoom changes much more, and its search takes twice as long.
+        """
+        camera = self.camera
+        known = camera is not None and (camera.zoom is not None or not self.video.lens.is_pinhole)
+        return camera if known else None
 
     def _best_camera(self) -> MotionCamera:
         """Return what is known of the camera so far, its lens and zoom too."""

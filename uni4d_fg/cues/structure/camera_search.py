@@ -103,7 +103,7 @@ def find_camera(
         if _is_lens(lens.camera, image_size, config) and judge.better(lens, plain)[0] > 0.0:
             best = lens
     if asks_for_zoom:
-        zoom = _find_zoom(scene, real, image_size, config, grown)
+        zoom = _find_zoom(plain, judge, scene, real, image_size, config, grown)
         if zoom is not None and _is_zoom(zoom.camera, config):
             agree = judge.better(zoom, plain)[1]
             if agree >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0:
@@ -233,9 +233,14 @@ def _joint(start: _Fitted, model: LensModel, config: Config, options: dict[str, 
 
 
 def _find_zoom(
-    scene: GrowingScene, real: Observations, image_size: tuple[int, int], config: Config, grown: Grown
-) -> _Fitted | None:
-    """Grow scenes from tracks whose zoom is undone, and free what is left of it; None if none grows."""
+    plain: _Fitted, judge: _Judge, scene: GrowingScene, real: Observations, image_size: tuple[int, int], config: Config,
+    grown: Grown,
+) -> _Fitted | None:  # fmt: skip
+    """Grow scenes from tracks whose zoom is undone, and free what is left of it.
+
+    None if no scene grows, or if after a round most tracks fit the camera that does not zoom better: of a zoom that is
+    one, seven tenths or more fit it then.
+    """
     log_ratio = similarities(scene.observations, len(scene.registered), image_size)
     camera = MotionCamera(scene.prior_intrinsics, zoom=log_ratio - log_ratio.max())
     settings = config.camera
@@ -250,6 +255,8 @@ def _find_zoom(
         found = _free_zoom(_Fitted(camera, part), config, to_the_end)
         assert camera.zoom is not None
         assert found.camera.zoom is not None
+        if judge.better(found, plain)[1] < 0.5:
+            return None
         settled = float(np.ptp(found.camera.zoom - camera.zoom)) < _SETTLED
         camera = found.camera
         if settled:
