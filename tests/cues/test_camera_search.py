@@ -15,6 +15,7 @@ from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.structure.camera_search import similarities
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
 from uni4d_fg.cues.structure.motion_camera import MotionCamera
+from uni4d_fg.cues.track_motion import QuadraticGrid, SharedError
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import project, unproject, world_to_camera
 from uni4d_fg.geometry.lens import Lens
@@ -177,3 +178,17 @@ def test_pixels_of_a_static_scene_in_another_frame(camera: MotionCamera) -> None
     expected = (there + 0.5) * scale - 0.5
     found = np.stack([np.broadcast_to(static.u, z.shape), np.broadcast_to(static.v, z.shape)], axis=-1).reshape(-1, 2)
     np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_what_tracks_share_is_moved_to_the_pixels_of_a_zoom(rng: np.random.Generator) -> None:
+    size, scale = (120, 160), np.array([0.5, 0.5])
+    error = SharedError(rng.normal(0, 1, (6, 2)), SIZE)
+    plain = PixelGrid.of(MotionCamera(K), size, scale).displacement(error, 0, 1)
+    fast = QuadraticGrid.of(size, scale, SIZE).displacement(error)
+    np.testing.assert_allclose(plain, fast, atol=1e-4)
+    camera = MotionCamera(K, zoom=ramp(1.6))
+    found = PixelGrid.of(camera, size, scale).displacement(error, 3, 11)
+    row, column = 30, 110
+    ideal = camera.ideal(np.array([[(column + 0.5) / 0.5 - 0.5, (row + 0.5) / 0.5 - 0.5]]), np.array([3]))[0]
+    expected = np.array(error.at(ideal[0], ideal[1])) * 0.5 * np.exp(ramp(1.6)[11])
+    np.testing.assert_allclose([found[0][row, column], found[1][row, column]], expected, rtol=1e-5)

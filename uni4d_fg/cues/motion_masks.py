@@ -297,7 +297,10 @@ class _Comparison:
     def _pair(self, pair: tuple[int, int]) -> Float32Array:
         source, target = pair
         error = self.motion.shared.get(pair)
-        shared = None if error is None else self.grid.displacement(error)
+        shared = None
+        if error is not None:
+            plain = self.pixels.camera.is_plain
+            shared = self.grid.displacement(error) if plain else self.pixels.displacement(error, source, target)
         pose = relative_pose(self.cameras.world_T_cam, source, target)
         static = self.pixels.predict(self._frame(source).z, pose, source, target)
         return moved_evidence(self._frame(source), self._frame(target), static, shared, self.config)

@@ -9,6 +9,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.cues.static_scene import StaticPrediction, predict_static_at
 from uni4d_fg.cues.structure.motion_camera import MotionCamera
+from uni4d_fg.cues.track_motion import SharedError
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,8 @@ class PixelGrid:
     columns: Float32Array
     """Of the pixels, or of the ideal ones of a lens, of a shape that NumPy broadcasts to (h, w)."""
     rows: Float32Array
+    scale: FloatArray
+    """(2,) pixels per pixel of the images, x and y."""
 
     @classmethod
     def of(cls, camera: MotionCamera, size: tuple[int, int], scale: FloatArray) -> PixelGrid:
@@ -30,10 +33,10 @@ class PixelGrid:
         camera = replace(camera, intrinsics=intrinsics)
         columns, rows = np.arange(size[1], dtype=np.float32), np.arange(size[0], dtype=np.float32)[:, None]
         if camera.lens.is_pinhole:
-            return cls(camera, columns, rows)
+            return cls(camera, columns, rows, scale)
         pixels = np.stack(np.broadcast_arrays(columns, rows), axis=-1).astype(np.float64)
         ideal = camera.lens.ideal_pixels(intrinsics, pixels).astype(np.float32)
-        return cls(camera, np.ascontiguousarray(ideal[..., 0]), np.ascontiguousarray(ideal[..., 1]))
+        return cls(camera, np.ascontiguousarray(ideal[..., 0]), np.ascontiguousarray(ideal[..., 1]), scale)
 
     def predict(self, z: Float32Array, target_T_source: FloatArray, source: int, target: int) -> StaticPrediction:
         """Return where the pixels of a frame with depth z (h, w) are seen in another; NaN where no ray is known.
@@ -47,6 +50,20 @@ class PixelGrid:
         ideal = np.stack([static.u, static.v], axis=-1).astype(np.float64)
         real = self.camera.lens.real_pixels(self.camera.intrinsics, ideal).astype(np.float32)
         return replace(static, u=real[..., 0], v=real[..., 1])
+
+    def displacement(self, error: SharedError, source: int, target: int) -> tuple[Float32Array, Float32Array]:
+        """Return what tracks of two frames share at ideal pixels of the images, as displacements (h, w) in x and y.
+
+        Through a lens they are taken as they are: that they are squeezed there matters less than that they are known.
+        """
+        (cx, cy), zoom = self.camera.intrinsics[2:], self.camera.zoom
+        shrunk, grown = (1.0, 1.0) if zoom is None else (np.exp(-zoom[source]), np.exp(zoom[target]))
+        u, v = (
+            (center + (at - center) * shrunk + 0.5) / scale - 0.5
+            for at, center, scale in ((self.columns, cx, self.scale[0]), (self.rows, cy, self.scale[1]))
+        )
+        x, y = (part * grown * scale for part, scale in zip(error.at(u, v), self.scale, strict=True))
+        return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
     def _intrinsics(self, frame: int) -> FloatArray:
         zoom = self.camera.zoom
