@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.pixel_grid import PixelGrid
+from uni4d_fg.cues.structure import motion
 from uni4d_fg.cues.structure.camera_search import similarities
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
 from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.track_motion import QuadraticGrid, SharedError
+from uni4d_fg.errors import SolverError
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import project, unproject, world_to_camera
 from uni4d_fg.geometry.lens import Lens
@@ -92,6 +94,23 @@ def test_a_zoom_is_found_from_tracks_alone(ratio: float) -> None:
 def test_a_pinhole_that_does_not_zoom_is_left_one(path, moving: int) -> None:  # type: ignore[no-untyped-def]
     scene = tracked(path(FRAMES), points=1500, moving=moving)
     assert structure(scene).camera.is_plain
+
+
+def test_a_zoom_that_is_asked_for_is_taken_and_one_beside_another_model_not_sought() -> None:
+    scene = tracked(sideways(FRAMES))
+    asked = structure(scene, "camera.zoom=on").camera.zoom
+    assert asked is not None
+    assert np.ptp(asked) < 0.02
+    zoomed = through(scene, MotionCamera(K, zoom=ramp(1.6)))
+    assert structure(zoomed, "camera.model=pinhole").camera.is_plain
+
+
+def test_a_search_that_fails_leaves_the_pinhole(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise SolverError("no")
+
+    monkeypatch.setattr(motion, "find_camera", fail)
+    assert structure(tracked(sideways(FRAMES))).camera.is_plain
 
 
 def test_a_camera_that_is_known_is_not_looked_for() -> None:
@@ -192,3 +211,19 @@ def test_what_tracks_share_is_moved_to_the_pixels_of_a_zoom(rng: np.random.Gener
     ideal = camera.ideal(np.array([[(column + 0.5) / 0.5 - 0.5, (row + 0.5) / 0.5 - 0.5]]), np.array([3]))[0]
     expected = np.array(error.at(ideal[0], ideal[1])) * 0.5 * np.exp(ramp(1.6)[11])
     np.testing.assert_allclose([found[0][row, column], found[1][row, column]], expected, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_long_video_is_judged_on_part_of_its_frames() -> None:
+    frames = 260
+    plain = tracked(sideways(frames), points=900, life=130)
+    zoom = np.linspace(-np.log(1.6), 0.0, frames)
+    scene = through(plain, MotionCamera(K, zoom=zoom))
+    found = structure_from_motion(
+        scene.observations, frames, SIZE, GUESS, load_config("default", []), SilentReporter(), lambda: False,
+        any_camera=True,
+    )  # fmt: skip
+    assert found is not None
+    assert found.camera.zoom is not None
+    np.testing.assert_allclose(found.intrinsics[0] * np.exp(found.camera.zoom), K[0] * np.exp(zoom), rtol=0.04)
+    assert path_error(found, scene) < 0.004

@@ -27,7 +27,7 @@ from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.structure.trimming import trim
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, OPENCV_CAMERA, POSE, ZOOM
 from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
@@ -35,9 +35,10 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
-from uni4d_fg.slam.lens.problems import RealPixels, lens_problem, zoom_problem
+from uni4d_fg.slam.lens.problems import RealPixels, is_far, lens_problem, zoom_problem
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames
 
 Grown = Callable[[Observations, FloatArray], GrowingScene | None]
 """Grows a scene from ideal observations, with intrinsics that are held."""
@@ -57,8 +58,10 @@ _FAR_APART = 0.1
 _PAIRS = 4000
 _LOST = 50.0
 """Errors, in sigmas, are cut here: what a camera does not explain counts as much."""
-_FAR = 3.0
-"""A parameter farther from zero than so many sigmas of its prior is no lens."""
+_MAX_FRAMES = 120
+"""Frames that cameras are compared on, at most: a focal length per frame makes the system of the cameras dense."""
+_SIGHTINGS = 4
+"""In so many of them an average track is seen at least."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +92,10 @@ def find_camera(
     """
     settings = config.camera
     part = _part_of(scene, settings.observations)
+    if not part.good.any():
+        return None
     plain = _Fitted(MotionCamera(part.intrinsics), part)
-    asks_for_zoom = settings.zoom == "auto" and _asks_for_zoom(plain, config)
+    asks_for_zoom = _asks_for_zoom(plain, config)
     asks_for_lens = settings.model == "auto" and (
         _joint(plain, "SIMPLE_RADIAL", config, _probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
@@ -104,16 +109,21 @@ def find_camera(
             best = lens
     if asks_for_zoom:
         zoom = _find_zoom(plain, judge, scene, real, image_size, config, grown)
-        if zoom is not None and _is_zoom(zoom.camera, config):
-            agree = judge.better(zoom, plain)[1]
-            if agree >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0:
-                best = zoom
+        if zoom is not None and (settings.zoom == "on" or _is_zoom(zoom, plain, best, judge, config)):
+            best = zoom
     return None if best is plain else best.camera
 
 
 def _part_of(scene: GrowingScene, observations: int) -> GrowingScene:
-    """Return the scene with evenly spread tracks that have about so many observations together."""
-    return _scene_of(scene.observations.select(scene.observations.thinned(observations)), scene)
+    """Return the scene with evenly spread tracks that have about so many observations together, in some frames."""
+    seen = scene.observations
+    count = np.bincount(scene.row, minlength=scene.num_tracks)
+    last = np.cumsum(count) - 1
+    spans = TrackSpans(seen.frame[last - count + 1], seen.frame[last], count)
+    chosen = np.zeros(len(scene.registered), dtype=bool)
+    chosen[calibration_frames(spans, len(chosen), _MAX_FRAMES, _SIGHTINGS)] = True
+    seen = seen.select(chosen[seen.frame]).with_min_observations(2)
+    return _scene_of(seen.select(seen.thinned(observations)), replace(scene, registered=scene.registered & chosen))
 
 
 def _scene_of(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
@@ -166,21 +176,29 @@ class _Judge:
 
 
 def _asks_for_zoom(plain: _Fitted, config: Config) -> bool:
+    settings = config.camera
+    if settings.zoom != "auto" or settings.model != "auto":
+        return settings.zoom == "on"
+    posed = np.flatnonzero(plain.scene.registered)
+    if posed[-1] + int(np.diff(posed).max(initial=1)) < len(plain.scene.registered):
+        return False  # Tracks are too short for so many frames, and nothing would be known of the rest.
     probe = _free_zoom(plain, config, _probing(config))
     assert probe.camera.zoom is not None
-    settings = config.camera
     moves = float(np.ptp(probe.camera.zoom)) >= _PROBED * settings.min_zoom
     return probe.evidence >= settings.min_zoom_evidence and moves
 
 
-def _is_zoom(camera: MotionCamera, config: Config) -> bool:
-    assert camera.zoom is not None
-    return float(np.expm1(np.ptp(camera.zoom))) >= config.camera.min_zoom
+def _is_zoom(zoom: _Fitted, plain: _Fitted, best: _Fitted, judge: _Judge, config: Config) -> bool:
+    """Tell whether the focal length changes enough, for most tracks, and explains all together better than the best."""
+    settings, log_focal = config.camera, zoom.camera.zoom
+    if log_focal is None or float(np.expm1(np.ptp(log_focal))) < settings.min_zoom:
+        return False
+    return judge.better(zoom, plain)[1] >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0
 
 
 def _is_lens(camera: MotionCamera, image_size: tuple[int, int], config: Config) -> bool:
     settings, lens = config.camera, camera.lens
-    if max(map(abs, lens.parameters)) > _FAR * settings.parameter_prior_sigma:
+    if is_far(lens, settings):
         return False
     return settings.min_displacement_px < lens.displacement(camera.intrinsics, image_size) < np.inf
 
@@ -190,14 +208,17 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     starts = []
     for k1 in config.camera.starts:
         camera = MotionCamera(plain.camera.intrinsics, Lens("SIMPLE_RADIAL", (k1,)))
-        scene = _scene_of(camera.ideal_observations(judge.real), plain.scene)
-        scene.adjust()
-        scene.triangulate_all()
-        scene.adjust()
+        try:
+            scene = _scene_of(camera.ideal_observations(judge.real), plain.scene)
+            scene.adjust()
+            scene.triangulate_all()
+            scene.adjust()
+        except SolverError:  # so strong a lens leaves too little of the image
+            continue
         starts.append(_Fitted(camera.with_intrinsics(scene.intrinsics), scene))
-    found = starts[0]
-    for start in starts[1:]:
-        if judge.better(start, found)[0] > 0.0:
+    found = plain
+    for start in starts:
+        if found is plain or judge.better(start, found)[0] > 0.0:
             found = start
     settings = config.camera
     to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
@@ -255,7 +276,7 @@ def _find_zoom(
         found = _free_zoom(_Fitted(camera, part), config, to_the_end)
         assert camera.zoom is not None
         assert found.camera.zoom is not None
-        if judge.better(found, plain)[1] < 0.5:
+        if settings.zoom == "auto" and judge.better(found, plain)[1] < 0.5:
             return None
         settled = float(np.ptp(found.camera.zoom - camera.zoom)) < _SETTLED
         camera = found.camera

@@ -23,7 +23,7 @@ from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
 from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.cues.structure.two_view import fit_rotation
-from uni4d_fg.errors import Cancelled
+from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.stages.observations import Observations
@@ -119,10 +119,13 @@ def structure_from_motion(
     if any_camera and free_focal:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
-        found = find_camera(
-            grown.scene, observations, image_size, config,
-            lambda ideal, known: None if (new := quiet.grow(ideal, known, False)) is None else new.scene,
-        )  # fmt: skip
+        try:
+            found = find_camera(
+                grown.scene, observations, image_size, config,
+                lambda ideal, known: None if (new := quiet.grow(ideal, known, False)) is None else new.scene,
+            )  # fmt: skip
+        except SolverError:  # That of another camera is no reason to do without this one.
+            found = None
         reporter.end()
         if found is not None:
             ideal = found.ideal_observations(observations)

@@ -30,12 +30,10 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit
+from uni4d_fg.slam.lens.problems import is_far
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
-
-_FAR = 3.0
-"""A parameter that is farther from zero than so many sigmas of its prior is no lens: it makes up for what moves."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +182,7 @@ def is_taken(
         return False
     if not settings.min_displacement_px < candidate.displacement_px < np.inf:
         return False
-    if max(map(abs, candidate.lens.parameters), default=0.0) > _FAR * settings.parameter_prior_sigma:
+    if is_far(candidate.lens, settings):
         return False
     unsure = candidate.displacement_px < settings.sure_displacement * max(image_size)
     if unsure and not after_another and candidate.evidence < settings.min_evidence_unsure:
