@@ -99,3 +99,14 @@ def test_dropped_shares_and_scales_are_judged(run: Run) -> None:
 def test_what_is_said_twice_is_said_once(run: Run) -> None:
     summary = {**run.summary, "warnings": ["depth is odd"], "cues": {"warnings": ["depth is odd"], "metric": True}}
     assert distrusted(run.with_parts(summary=summary), None) == ["Depth is odd."]
+
+
+def test_probes_are_not_meant_to_converge(run: Run, residuals: Residuals) -> None:
+    solves = run.summary["stages"]["lens"]["solves"]
+    probes = [solve for solve in solves if solve["name"].endswith("probe]")]
+    assert any(not str(solve["termination"]).startswith("converged") for solve in probes)
+    named = [solve | {"name": "lens[zoom]"} for solve in probes]
+    assert not distrusted(run, residuals)
+    assert any(
+        "Stage lens" in reason for reason in distrusted(with_stage(run, "lens", solves=solves + named), residuals)
+    )

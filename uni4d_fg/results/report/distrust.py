@@ -47,6 +47,8 @@ def _sentence(text: Any) -> str:
 def _solvers(summary: dict[str, Any]) -> Iterator[str]:
     for name, stage in summary.get("stages", {}).items():
         solves = stage.get("solves", [])
+        # A probe takes a few steps and is not meant to converge.
+        solves = [s for s in solves if not str(s.get("name", "")).endswith("probe]")]
         stopped = [s for s in solves if not str(s.get("termination", "")).startswith(("converged", "nothing"))]
         if not stopped:
             continue

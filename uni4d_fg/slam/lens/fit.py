@@ -159,6 +159,7 @@ class LensFit:
         """Solve with the parameters held, and then free: what the second gains is the evidence for them."""
         camera_config, ba = self.config.camera, self.config.bundle_adjustment
         variable, _, _ = lens_family(model)
+        probe = "" if options is None else " probe"
         problem, state = self._problem(scene, lens, model)
         until_the_end = {
             "relative_decrease": camera_config.relative_decrease,
@@ -166,11 +167,11 @@ class LensFit:
         }
         solver = ba.solver.model_copy(update=dict(options or until_the_end))
         pixel = [] if ba.free_principal_point else [2, 3]
-        held = Stage("lens", replace(problem).fix(variable, entries=[*pixel, 4, 5, 6, 7]), solver, part="held")
+        held = Stage("lens", replace(problem).fix(variable, entries=[*pixel, 4, 5, 6, 7]), solver, part=f"held{probe}")
         state, before = self.run(held, state, self.hooks)
         self.note([before])
         unused = range(4 + len(PARAMETERS[model]), 8)
-        free = Stage("lens", replace(problem).fix(variable, entries=[*pixel, *unused]), solver, part=model)
+        free = Stage("lens", replace(problem).fix(variable, entries=[*pixel, *unused]), solver, part=f"{model}{probe}")
         state, after = self.run(free, state, self.hooks)
         self.note([after])
         camera = state[variable][0]

@@ -59,7 +59,7 @@ class ZoomFit:
             "initial_damping": 1e-9,
             "relative_decrease": 0.0,
         }
-        return self.solve(scene, steps)
+        return self.solve(scene, steps, "zoom probe")
 
     def refine(self, start: FittedZoom) -> FittedZoom:
         """Undo a zoom, run stages 1 and 2 again, and find what is left of it.
@@ -81,12 +81,13 @@ class ZoomFit:
         cameras = replace(left.cameras, intrinsics=intrinsics)
         return replace(left, zoom=zoom - longest, intrinsics=intrinsics, evidence=start.evidence, cameras=cameras)
 
-    def solve(self, scene: StaticScene, options: Mapping[str, float] | None = None) -> FittedZoom:
+    def solve(self, scene: StaticScene, options: Mapping[str, float] | None = None, part: str = "zoom") -> FittedZoom:
         """Solve everything together, from a camera that does not zoom.
 
         Args:
             scene: Stages 1 and 2 of such a camera.
             options: Changes of the solver's settings; to the end when None.
+            part: What the solve is called.
 
         Raises:
             SolverError: If a system is singular.
@@ -97,7 +98,7 @@ class ZoomFit:
         to_the_end = {"relative_decrease": camera.relative_decrease, "max_iterations": camera.max_iterations}
         solver = ba.solver.model_copy(update=dict(options or to_the_end))
         before = problem.energies(state)["static_reprojection"]
-        stage = Stage("lens", problem, solver, part="zoom")
+        stage = Stage("lens", problem, solver, part=part)
         state, after = self.fit.run(stage, state, self.fit.hooks)
         self.fit.note([after])
         gain = after.initial_energy - after.final_energy
