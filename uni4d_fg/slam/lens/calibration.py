@@ -29,7 +29,7 @@ from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
-from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit
+from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit, without_depth
 from uni4d_fg.slam.lens.problems import is_far
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
@@ -135,8 +135,12 @@ def calibrate_lens(
     if evidence < settings.min_evidence:
         note = f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"
         return LensCalibration(Lens(), intrinsics, [], fit.solves, note, zoom)
-    judge = HeldOut(config, some.without(~held_out), run, hooks)
-    best, candidates = _find_lens(fit, judge, pinhole, evidence, settings, image_size)
+    # Errors of a depth cue bend a valley as narrow as that. It has a say where tracks alone tell no lens.
+    for trial in (replace(fit, config=without_depth(config)), fit):
+        judge = HeldOut(trial.config, some.without(~held_out), run, hooks)
+        best, candidates = _find_lens(trial, judge, pinhole, evidence, settings, image_size)
+        if best is not pinhole:
+            break
     if zoom is not None and zoom.beside_lens:
         compared = solve_zoom(zooming, pinhole.scene, best, count, settings)
         if compared.zoom is not None:
