@@ -187,7 +187,7 @@ def test_pixels_of_a_static_scene_in_another_frame(camera: MotionCamera) -> None
     pose[:3, :3], pose[:3, 3] = so3_exp(np.array([0.02, -0.05, 0.03])), [0.2, -0.1, 0.15]
     z = np.full((height, width), 2.5, np.float32)
     z[40:80, 50:90] = 1.5
-    static = PixelGrid.of(camera, (height, width), scale).predict(z, pose, 3, 11)
+    static = PixelGrid.of(camera, (height, width), SIZE).predict(z, pose, 3, 11)
     rows, columns = np.mgrid[0:height, 0:width]
     small = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
     full = (small + 0.5) / scale - 0.5
@@ -202,11 +202,11 @@ def test_pixels_of_a_static_scene_in_another_frame(camera: MotionCamera) -> None
 def test_what_tracks_share_is_moved_to_the_pixels_of_a_zoom(rng: np.random.Generator) -> None:
     size, scale = (120, 160), np.array([0.5, 0.5])
     error = SharedError(rng.normal(0, 1, (6, 2)), SIZE)
-    plain = PixelGrid.of(MotionCamera(K), size, scale).displacement(error, 0, 1)
+    plain = PixelGrid.of(MotionCamera(K), size, SIZE).displacement(error, 0, 1)
     fast = QuadraticGrid.of(size, scale, SIZE).displacement(error)
     np.testing.assert_allclose(plain, fast, atol=1e-4)
     camera = MotionCamera(K, zoom=ramp(1.6))
-    found = PixelGrid.of(camera, size, scale).displacement(error, 3, 11)
+    found = PixelGrid.of(camera, size, SIZE).displacement(error, 3, 11)
     row, column = 30, 110
     ideal = camera.ideal(np.array([[(column + 0.5) / 0.5 - 0.5, (row + 0.5) / 0.5 - 0.5]]), np.array([3]))[0]
     expected = np.array(error.at(ideal[0], ideal[1])) * 0.5 * np.exp(ramp(1.6)[11])

@@ -127,7 +127,7 @@ def test_evidence_of_pixels(rng: np.random.Generator) -> None:
     near = np.full((120, 160), 2.0, np.float32)
     near[20:60, 100:140] = 1.0  # something else in front
     zero = np.zeros((120, 160), np.float32)
-    pixels = PixelGrid.of(MotionCamera(INTRINSICS), (120, 160), np.ones(2))
+    pixels = PixelGrid.of(MotionCamera(INTRINSICS), (120, 160), (120, 160))
 
     def evidence(second: np.ndarray, depth: np.ndarray, pose: np.ndarray, edge_px: int = 1) -> np.ndarray:
         first, other = (

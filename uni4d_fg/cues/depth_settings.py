@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from uni4d_fg.config.models import Config
 from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.slam.stages import bundle_adjustment
 
 OPEN_FOCAL_SIGMA = 0.03
 """Standard deviation of the log focal length beyond which camera motion leaves it open."""
@@ -71,5 +72,5 @@ def settings_of_motion(config: Config) -> Config:
 
 def without_depth_prior(config: Config) -> Config:
     """Return the configuration with which the depth cue says nothing of the cameras."""
-    stage = config.bundle_adjustment.model_copy(update={"depth_prior": False})
+    stage = bundle_adjustment.without_depth_prior(config.bundle_adjustment)
     return config.model_copy(update={"bundle_adjustment": stage})

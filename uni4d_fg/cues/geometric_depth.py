@@ -54,8 +54,8 @@ class GeometricDepth:
     """T maps (H, W), in the unit of the result; every pixel has a value."""
     world_T_cam: FloatArray
     """(T, 4, 4); the first camera is the world."""
-    intrinsics: FloatArray
-    """(4,) px."""
+    camera: MotionCamera
+    """Intrinsics, lens and zoom."""
     sparse: Float32Array
     """(K, T) depth of every static observation that is triangulated well, NaN elsewhere."""
     moving: BoolArray
@@ -64,8 +64,6 @@ class GeometricDepth:
     """False if the camera stays in one place, so that depth is a convention."""
     focal_sigma: float
     """Standard deviation of the log of the focal lengths that were found; 0 for those that were held."""
-    camera: MotionCamera
-    """Lens and zoom, with the intrinsics."""
     facts: tuple[str, ...]
     """What was found, one line each."""
     warnings: tuple[str, ...]
@@ -74,6 +72,11 @@ class GeometricDepth:
     """What the motion leaves open, for the summary of a run: ``focal_interval_px`` (95 %), ``stretch_along_view`` (by
     which factors depth and motion along the viewing direction may be wrong), ``unexplained`` (part of the held-out
     tracks), ``registered`` (part of the frames), ``starts`` (those that explain the tracks nearly as well)."""
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(4,) px."""
+        return self.camera.intrinsics
 
 
 def depth_from_motion(
@@ -172,8 +175,8 @@ def _with_maps(
     moving = np.zeros(tracks.num_tracks, dtype=bool)
     moving[structure.track] = structure.moving
     return GeometricDepth(
-        depths, structure.world_T_cam, structure.intrinsics, sparse, moving, True, structure.focal_sigma,
-        structure.camera, facts, warnings, start,
+        depths, structure.world_T_cam, structure.camera, sparse, moving, True, structure.focal_sigma, facts, warnings,
+        start,
     )  # fmt: skip
 
 
@@ -305,7 +308,7 @@ def _without_parallax(
         f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
     )
     moving = np.zeros(tracks.num_tracks, dtype=bool)
-    return GeometricDepth(depths, poses, intrinsics, sparse, moving, False, 0.0, camera, ("no parallax",), warnings)
+    return GeometricDepth(depths, poses, camera, sparse, moving, False, 0.0, ("no parallax",), warnings)
 
 
 def _on_sphere(uv: FloatArray, intrinsics: FloatArray, radius: float) -> FloatArray:

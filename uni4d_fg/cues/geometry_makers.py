@@ -89,11 +89,10 @@ def geometric_depth(
         depths = GridDepths(tuple(stored["grids"].astype(np.float32)), video.image_size, target.name)
     else:
         depths = FloatMaps(tuple(cache.map_path(name) for name in names), video.image_size)
+    camera = MotionCamera.of_array(stored["camera"], stored["intrinsics"])
     return GeometricDepth(
-        depths, stored["world_T_cam"], stored["intrinsics"],
-        stored["sparse"].astype(np.float32), stored["moving"], bool(stored["has_parallax"][0]),
-        float(stored["focal_sigma"][0]), MotionCamera.of_array(stored["camera"], stored["intrinsics"]), tuple(facts),
-        tuple(warnings), start,
+        depths, stored["world_T_cam"], camera, stored["sparse"].astype(np.float32), stored["moving"],
+        bool(stored["has_parallax"][0]), float(stored["focal_sigma"][0]), tuple(facts), tuple(warnings), start,
     )  # fmt: skip
 
 

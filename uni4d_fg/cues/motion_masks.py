@@ -226,7 +226,7 @@ class _Comparison:
         self.cameras, self.motion, self.config = cameras, motion, config
         self.size = shrunk_size(video.image_size, working_scale(video.image_size, config.working_size_px))
         self.scale = np.array([self.size[1] / video.image_size[1], self.size[0] / video.image_size[0]])
-        self.pixels = PixelGrid.of(replace(camera, intrinsics=cameras.intrinsics), self.size, self.scale)
+        self.pixels = PixelGrid.of(replace(camera, intrinsics=cameras.intrinsics), self.size, video.image_size)
         self.grid = QuadraticGrid.of(self.size, self.scale, video.image_size)
         self.images: dict[int, ImageArray] = {}
         self.frames: dict[int, FrameAppearance] = {}

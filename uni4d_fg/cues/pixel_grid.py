@@ -10,6 +10,8 @@ from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.cues.static_scene import StaticPrediction, predict_static_at
 from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.track_motion import SharedError
+from uni4d_fg.factors.zoom import zoomed_intrinsics
+from uni4d_fg.frontend.sequence.resize import scale_intrinsics
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,10 @@ class PixelGrid:
     """(2,) pixels per pixel of the images, x and y."""
 
     @classmethod
-    def of(cls, camera: MotionCamera, size: tuple[int, int], scale: FloatArray) -> PixelGrid:
-        """Return the grid of images of (h, w) ``size`` that are ``scale`` (2,) times those of the camera."""
-        (fx, fy, cx, cy), (sx, sy) = camera.intrinsics, scale
-        # Pixel centers are integers: (u + 1/2) scales.
-        intrinsics = np.array([fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5])
+    def of(cls, camera: MotionCamera, size: tuple[int, int], image_size: tuple[int, int]) -> PixelGrid:
+        """Return the grid of images of (h, w) ``size``, of a camera whose images have ``image_size``."""
+        scale = np.array([size[1] / image_size[1], size[0] / image_size[0]])
+        intrinsics = scale_intrinsics(camera.intrinsics, image_size, size)
         camera = replace(camera, intrinsics=intrinsics)
         columns, rows = np.arange(size[1], dtype=np.float32), np.arange(size[0], dtype=np.float32)[:, None]
         if camera.lens.is_pinhole:
@@ -66,8 +67,5 @@ class PixelGrid:
         return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
     def _intrinsics(self, frame: int) -> FloatArray:
-        zoom = self.camera.zoom
-        if zoom is None:
-            return self.camera.intrinsics
-        ratio = np.exp(zoom[frame])
-        return np.asarray(self.camera.intrinsics * np.array([ratio, ratio, 1.0, 1.0]))
+        intrinsics, zoom = self.camera.intrinsics, self.camera.zoom
+        return intrinsics if zoom is None else np.asarray(zoomed_intrinsics(intrinsics, zoom[frame : frame + 1]))

@@ -128,13 +128,19 @@ def _part_of(scene: GrowingScene, observations: int) -> GrowingScene:
 
 def _scene_of(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
     """Return a scene of other observations with the cameras of one that is grown, trimmed."""
+    scene = _triangulated(ideal, cameras)
+    trim(scene)
+    scene.measure_noise()
+    return scene
+
+
+def _triangulated(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
+    """Return what the cameras of a scene see of other observations."""
     scene = GrowingScene.empty(
         ideal.with_min_observations(2), len(cameras.registered), cameras.intrinsics, cameras.config,
         free_focal=cameras.free_focal, prior_intrinsics=cameras.prior_intrinsics, should_stop=cameras.should_stop,
     )  # fmt: skip
     scene.continue_from(cameras)
-    trim(scene)
-    scene.measure_noise()
     return scene
 
 
@@ -148,14 +154,8 @@ class _Judge:
 
     def energies(self, fitted: _Fitted) -> FloatArray:
         """Return the mean robust energy (K,) of each track on real pixels; NaN where its rays are too parallel."""
-        tracks, row = self.real.rows()
-        ideal = fitted.camera.ideal_observations(self.real)
-        cameras = fitted.scene
-        scene = GrowingScene.empty(
-            ideal.with_min_observations(2), len(cameras.registered), cameras.intrinsics, cameras.config,
-            free_focal=False, prior_intrinsics=cameras.prior_intrinsics, should_stop=cameras.should_stop,
-        )  # fmt: skip
-        scene.continue_from(cameras)
+        tracks, _ = self.real.rows()
+        scene = _triangulated(fitted.camera.ideal_observations(self.real), fitted.scene)
         seen = scene.observations
         size = fitted.camera.ideal_weight(seen.uv, seen.frame)
         error = np.minimum(scene.errors() * np.sqrt(size) / self.sigma_px, _LOST)
@@ -234,11 +234,11 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
 
 def _joint(start: _Fitted, model: LensModel, config: Config, options: dict[str, float]) -> _Fitted:
     """Free the intrinsics, and then the parameters of a lens as well; the evidence is what the second takes away."""
-    bundle = _Bundle.of(start)
+    bundle = _Bundle.of(start.scene)
     camera = np.concatenate([start.scene.intrinsics, start.camera.lens.padded])
     problem, state = lens_problem(
-        bundle.state, bundle.stage.problem.batches, bundle.real(start), camera, model, start.scene.prior_intrinsics,
-        config.bundle_adjustment, config.camera,
+        bundle.state, bundle.stage.problem.batches, bundle.pixels(start.camera, config), camera, model,
+        start.scene.prior_intrinsics, config.bundle_adjustment, config.camera,
     )  # fmt: skip
     pixel = [] if config.bundle_adjustment.free_principal_point else [2, 3]
     solver = bundle.stage.solver.model_copy(update=options)
@@ -307,9 +307,10 @@ def similarities(observations: Observations, num_frames: int, image_size: tuple[
 
 def _free_zoom(start: _Fitted, config: Config, options: dict[str, float]) -> _Fitted:
     """Free a focal length per frame, beside that which was undone."""
-    bundle = _Bundle.of(start)
+    bundle = _Bundle.of(start.scene)
+    ideal = bundle.pixels(MotionCamera(start.scene.intrinsics), config)
     problem, state = zoom_problem(
-        bundle.state, bundle.stage.problem.batches, bundle.ideal, bundle.frames, config.bundle_adjustment, config.camera
+        bundle.state, bundle.stage.problem.batches, ideal, bundle.frames, config.bundle_adjustment, config.camera
     )
     before = problem.energies(state)["static_reprojection"]
     solver = bundle.stage.solver.model_copy(update=options)
@@ -327,40 +328,29 @@ def _free_zoom(start: _Fitted, config: Config, options: dict[str, float]) -> _Fi
 
 @dataclass(frozen=True)
 class _Bundle:
-    """Bundle adjustment of a scene, and its observations with the rows of poses and landmarks."""
+    """Bundle adjustment of a scene, and what is seen in it."""
 
     stage: Stage
     state: State
     frames: IntArray
     """(F,) that have a pose."""
-    ideal: RealPixels
-    """Observations at ideal pixels."""
+    used: Observations
+    """Those that take part, at ideal pixels."""
+    sigma_px: float
 
     @classmethod
-    def of(cls, fitted: _Fitted) -> _Bundle:
-        scene = fitted.scene
+    def of(cls, scene: GrowingScene) -> _Bundle:
         stage, state, frames, _ = scene.bundle()
-        used, row = scene.used()
-        _, row = np.unique(row, return_inverse=True)
         sigma = scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px
-        return cls(stage, state, frames, cls._pixels(scene, used, used.weight, row, frames, sigma))
+        return cls(stage, state, frames, scene.used()[0], sigma)
 
-    @staticmethod
-    def _pixels(
-        scene: GrowingScene, used: Observations, weight: FloatArray, row: IntArray, frames: IntArray, sigma: float
-    ) -> RealPixels:
-        frame = np.searchsorted(frames, used.frame)
-        kernel = scene.config.bundle_adjustment.reprojection_kernel
-        return RealPixels(frame, row, used.uv, MAP.observed(sigma, weight, kernel, frame, len(frames)))
-
-    def real(self, fitted: _Fitted) -> RealPixels:
-        """Return the observations as the images show them."""
-        scene, camera = fitted.scene, fitted.camera
-        used, _ = scene.used()
+    def pixels(self, camera: MotionCamera, config: Config) -> RealPixels:
+        """Return the observations as a camera has them whose ideal pixels they are at."""
+        used, frame = self.used, np.searchsorted(self.frames, self.used.frame)
         weight = used.weight / camera.ideal_weight(used.uv, used.frame)
-        sigma = scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px
-        real = replace(used, uv=camera.real(used.uv, used.frame))
-        return self._pixels(scene, real, weight, self.ideal.row, self.frames, sigma)
+        kernel = config.bundle_adjustment.reprojection_kernel
+        noise = MAP.observed(self.sigma_px, weight, kernel, frame, len(self.frames))
+        return RealPixels(frame, used.rows()[1], camera.real(used.uv, used.frame), noise)
 
     def moved(self, scene: GrowingScene, state: State, intrinsics: FloatArray) -> GrowingScene:
         """Return a scene with the cameras of a state; its points are those of before."""

@@ -24,7 +24,12 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import Termination
-from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, without_camera_motion
+from uni4d_fg.slam.stages.bundle_adjustment import (
+    Freedom,
+    bundle_adjustment_problem,
+    without_camera_motion,
+    without_depth_prior,
+)
 from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
@@ -323,7 +328,7 @@ class GrowingScene:
 
 def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:
     """Return stage 2 without depth, and without E_cam: frames that have a pose need not follow each other."""
-    return without_camera_motion(config).model_copy(update={"depth_prior": False})
+    return without_depth_prior(without_camera_motion(config))
 
 
 def _resect(

@@ -35,10 +35,8 @@ class Structure:
 
     world_T_cam: FloatArray
     """(T, 4, 4)."""
-    intrinsics: FloatArray
-    """(4,) px; those of :attr:`camera`."""
     camera: MotionCamera
-    """What the pixels of the images are; errors, noise and focal lengths are those of its ideal pixels."""
+    """Intrinsics, lens and zoom; errors, noise and focal lengths are those of its ideal pixels."""
     registered: BoolArray
     """(T,) False for frames that are bridged."""
     track: IntArray
@@ -60,6 +58,11 @@ class Structure:
     :func:`~uni4d_fg.cues.structure.judging.unexplained`."""
     rivals: list[Rival]
     """Starts that explain them nearly as well."""
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(4,) px."""
+        return self.camera.intrinsics
 
 
 def observations_of_tracks(tracks: Tracks, which: BoolArray) -> Observations:
@@ -159,8 +162,8 @@ def structure_from_motion(
     track, points, moving = _triangulate_all(observations, poses, scene)
     reporter.end()
     return Structure(
-        poses, scene.intrinsics, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving,
-        sigma, best.pair, focal, focal_sigma, best.unexplained, rivals,
+        poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, sigma, best.pair,
+        focal, focal_sigma, best.unexplained, rivals,
     )  # fmt: skip
 
 

@@ -29,10 +29,11 @@ from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
-from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit, without_depth
+from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit
 from uni4d_fg.slam.lens.problems import is_far
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
+from uni4d_fg.slam.stages.bundle_adjustment import without_depth_prior
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
 
@@ -136,7 +137,9 @@ def calibrate_lens(
         note = f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"
         return LensCalibration(Lens(), intrinsics, [], fit.solves, note, zoom)
     # Errors of a depth cue bend a valley as narrow as that. It has a say where tracks alone tell no lens.
-    for trial in (replace(fit, config=without_depth(config)), fit):
+    stage = without_depth_prior(config.bundle_adjustment)
+    alone = replace(fit, config=config.model_copy(update={"bundle_adjustment": stage}))
+    for trial in (alone, fit):
         judge = HeldOut(trial.config, some.without(~held_out), run, hooks)
         best, candidates = _find_lens(trial, judge, pinhole, evidence, settings, image_size)
         if best is not pinhole:

@@ -62,12 +62,6 @@ def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
     return config.model_copy(update={"bundle_adjustment": stage if consecutive else without_camera_motion(stage)})
 
 
-def without_depth(config: Config) -> Config:
-    """Return the configuration of fits in which the depth cue has no say."""
-    stage = config.bundle_adjustment.model_copy(update={"depth_prior": False})
-    return config.model_copy(update={"bundle_adjustment": stage})
-
-
 @dataclass
 class LensFit:
     """Fits camera models to the same tracks.

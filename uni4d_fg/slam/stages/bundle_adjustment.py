@@ -62,6 +62,11 @@ def without_camera_motion(config: BundleAdjustmentConfig) -> BundleAdjustmentCon
     return config.model_copy(update={"camera_motion": still, "acceleration": free})
 
 
+def without_depth_prior(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:
+    """Return stage 2 in which the depth cue says nothing of the cameras."""
+    return config.model_copy(update={"depth_prior": False})
+
+
 def bundle_adjustment_problem(
     state: State,
     observations: Observations,
