@@ -27,8 +27,8 @@ from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "slam" / "lens"))
+from slam.lens.zooming import zoom_sequence
 from warping import warp_sequence
-from zooming import zoom_sequence
 
 pytest.importorskip("open3d")
 pytestmark = pytest.mark.slow

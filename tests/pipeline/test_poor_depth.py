@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 from hardened_cues import hardened_depth
 from pipeline_scenes import assert_same_result, make_config, make_scene, resumed_stages, run_sound, with_depth
+from slam.lens.zooming import ramp, zoom_sequence
 
 from uni4d_fg.config.synthetic import CueNoise
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import Sequence
-from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.geometry.lens import PINHOLE
+from uni4d_fg.pipeline import lens, reconstruct
 from uni4d_fg.progress import SilentReporter
 from uni4d_fg.results.evaluate.run import evaluate_run
+from uni4d_fg.slam.lens.calibration import LensCalibration
+from uni4d_fg.slam.lens.zoom import ZoomCalibration
 
 SIZE = {
     "num_frames": 20, "height": 120, "width": 160, "focal": 150.0, "grid_columns": 24, "grid_rows": 18,
@@ -51,11 +55,16 @@ def errors(sequence: Sequence, run_dir: Path, *overrides: str) -> tuple[float, f
     assert (STEP in summary.stages) == (ALWAYS not in overrides)
     truth = sequence.ground_truth
     assert truth.intrinsics is not None
-    assert truth.world_T_cam is not None
     path = evaluate_run(run_dir, sequence).to_dict()["trajectory"]
-    extent = float(np.linalg.norm(np.ptp(truth.world_T_cam[:, :3, 3], axis=0)))
     focal = float(np.abs(found.intrinsics[:2] / truth.intrinsics[:2] - 1).max())
-    return focal, path["ate_m"] / extent, float(np.log(path["scale"]))
+    return focal, path["ate_m"] / extent_of(sequence), float(np.log(path["scale"]))
+
+
+def extent_of(sequence: Sequence) -> float:
+    """Extent of the true path, m."""
+    poses = sequence.ground_truth.world_T_cam
+    assert poses is not None
+    return float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
 
 
 @pytest.mark.parametrize("seed", [5, 6])
@@ -74,6 +83,45 @@ def test_a_sound_cue_is_used(tmp_path: Path) -> None:
     scene = make_scene(SIZE)
     summary, _ = run_sound(with_depth(scene, hardened_depth(scene, 5, 0.0, 0.01, 2)), tmp_path, make_config())
     assert STEP not in summary.stages
+
+
+def test_a_lens_is_found_without_a_poor_cue(tmp_path: Path) -> None:
+    sequence = poor(camera_model="SIMPLE_RADIAL", distortion=(-0.12,))
+    summary, found = run_sound(sequence, tmp_path, make_config())
+    assert summary.stages["lens"]["camera_model"] == "PINHOLE"  # none was sought beside this cue
+    assert found.lens.parameters[0] == pytest.approx(-0.12, abs=0.002)
+    np.testing.assert_allclose(found.intrinsics, sequence.ground_truth.intrinsics, rtol=0.002)
+    assert any("focal lengths moved by 17 %" in warning for warning in summary.warnings)
+    path = evaluate_run(tmp_path, sequence).to_dict()["trajectory"]
+    assert path["ate_m"] < 2e-5 * extent_of(sequence)
+
+
+@pytest.mark.slow
+def test_a_zoom_beside_a_poor_cue_is_the_one_of_the_tracks(tmp_path: Path) -> None:
+    ratio = ramp(SIZE["num_frames"])
+    sequence = zoom_sequence(poor(), ratio)
+    _, found = run_sound(sequence, tmp_path, make_config())
+    truth = sequence.ground_truth.intrinsics
+    assert truth is not None
+    np.testing.assert_allclose(found.frame_intrinsics[:, 0], truth[0] * ratio, rtol=0.01)
+    path = evaluate_run(tmp_path, sequence).to_dict()["trajectory"]
+    assert path["ate_m"] < 1e-3 * extent_of(sequence)
+
+
+def test_a_zoom_that_only_a_poor_cue_asks_for_is_not_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = poor()
+
+    def zooming(labelled: Any, size: Any, intrinsics: np.ndarray, *_: Any) -> LensCalibration:
+        ratio = ramp(SIZE["num_frames"])
+        zoom = ZoomCalibration(ratio / ratio.max(), 1.6 * intrinsics, 6.0, 0.0, ("the camera zooms",))
+        return LensCalibration(PINHOLE, zoom.intrinsics, zoom=zoom)
+
+    monkeypatch.setattr(lens, "calibrate_lens", zooming)
+    summary, found = run_sound(sequence, tmp_path, make_config())
+    assert summary.stages["lens"]["facts"] == ["camera model PINHOLE", "the camera zooms"]
+    assert "the tracks alone ask for a pinhole that does not zoom" in summary.stages[STEP]["facts"]
+    assert found.zoom is None
+    np.testing.assert_allclose(found.intrinsics[:2], sequence.ground_truth.intrinsics[:2], rtol=5e-4)
 
 
 def test_a_camera_that_only_turns_keeps_the_cameras_of_the_cue(tmp_path: Path) -> None:

@@ -49,10 +49,15 @@ def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed:
         config = settings_of_motion(config)
     if sequence.depth_parallax and not (config.geometric_depth.depth_prior or depth_is_needed):
         config = without_depth_prior(config)
-    if sequence.depth_parallax is not None or depth_is_needed:
-        stage_1 = config.camera_init.model_copy(update={"max_depth_spread": None})
-        config = config.model_copy(update={"camera_init": stage_1})
-    return config
+    return settings_of_judgment(config, sequence, depth_is_needed=depth_is_needed)
+
+
+def settings_of_judgment(config: Config, sequence: Sequence, *, depth_is_needed: bool) -> Config:
+    """Return the configuration with which no depth cue is judged that was not given, or cannot be given up."""
+    if sequence.depth_parallax is None and not depth_is_needed:
+        return config
+    stage_1 = config.camera_init.model_copy(update={"max_depth_spread": None})
+    return config.model_copy(update={"camera_init": stage_1})
 
 
 def settings_of_motion(config: Config) -> Config:

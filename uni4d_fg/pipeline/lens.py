@@ -37,6 +37,11 @@ class CameraModel:
     focal_sigma: float | None = None
     """Standard deviation of the log focal length where camera motion told it with the rest; else None."""
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is a pinhole that does not zoom."""
+        return self.lens.is_pinhole and self.zoom is None
+
     def apply(
         self, sequence: Sequence, labelled: LabelledTracks, config: Config
     ) -> tuple[Sequence, LabelledTracks, Config]:
@@ -44,7 +49,7 @@ class CameraModel:
 
         Intrinsics are held, as lens and zoom are theirs; those of a zoom are of its longest focal length.
         """
-        if self.lens.is_pinhole and self.zoom is None:
+        if self.is_plain:
             return sequence, labelled, config
         ideal = ideal_tracks(labelled, self.intrinsics, self.lens)
         if self.zoom is not None:

@@ -20,7 +20,7 @@ from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.counted import counted
-from uni4d_fg.cues.depth_settings import settings_behind_lens
+from uni4d_fg.cues.depth_settings import settings_of_judgment
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
 from uni4d_fg.cues.plan import CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
@@ -46,6 +46,7 @@ from uni4d_fg.pipeline.assemble import assemble, write_result, write_views
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.control import BegunControl, static_control
 from uni4d_fg.pipeline.fingerprint import sequence_digest, stage_key
+from uni4d_fg.pipeline.first_cameras import StageInputs, first_cameras
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import KEPT, GraphValues
 from uni4d_fg.pipeline.in_progress import MUCH, RunInProgress
@@ -56,10 +57,9 @@ from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_c
 from uni4d_fg.pipeline.loops import loop_closing, with_loops
 from uni4d_fg.pipeline.measurements import MeasurementFiles, Measurements, read_measurements
 from uni4d_fg.pipeline.repeats import Repeats
-from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, camera_init_step, nonrigid_step
+from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary
-from uni4d_fg.pipeline.tracks_alone import without_poor_depth
 from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -208,7 +208,18 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
         solved, solved_tracks = repeats.sequence(sequence), repeats.labelled(labelled)
         summary.stages["tracks"]["facts"] = [*summary.stages["tracks"].get("facts", []), repeats.fact()]
         key = stage_key(key, repeats.solved.tolist())
-    key, camera = _camera(run, key, solved, solved_tracks)
+    judging = settings_of_judgment(config, sequence, depth_is_needed=not alone)
+    key, camera = _camera(run, key, solved, solved_tracks, judging)
+    begun = None
+    if windows:
+        inputs = StageInputs.of(solved, solved_tracks, camera, config, depth_is_needed=True)
+        key = stage_key(key, sequence.focal_sigma)
+    else:
+        begun = first_cameras(
+            run, stage_key(key, sequence.focal_sigma), solved, solved_tracks, camera, run_stage,
+            is_sought=is_sought(solved, config), depth_is_needed=not alone,
+        )  # fmt: skip
+        camera, inputs, key = begun.camera, begun.inputs, begun.key
     fragments = FragmentSearch.of(solved, solved_tracks, config.bundle_adjustment.rejoin)
     loops = loop_closing(solved, camera, config)
     if loops is not None:
@@ -220,10 +231,8 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
             labelled, scene, zoomed(scene["intrinsics"], zoom, sequence.num_frames), config.fusion
         )
     )
-    solved, solved_tracks, config = camera.apply(solved, solved_tracks, config)
-    config = settings_behind_lens(config, sequence, depth_is_needed=not alone)
-    key = stage_key(key, sequence.focal_sigma)
-    key, scene, motion = _stages(run, key, solved, solved_tracks, config, windows, run_stage, fragments, loops, static)
+    poses = None if begun is None else begun.poses
+    key, scene, motion = _stages(run, key, inputs, poses, windows, run_stage, fragments, loops, static)
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)
     adjusted = summary.stages["bundle_adjustment"]
@@ -247,38 +256,40 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
     return summary
 
 
-def _camera(run: RunInProgress, key: str, sequence: Sequence, labelled: LabelledTracks) -> tuple[str, CameraModel]:
+def _camera(
+    run: RunInProgress, key: str, sequence: Sequence, labelled: LabelledTracks, config: Config
+) -> tuple[str, CameraModel]:
     """Find the lens, where it is not given or ruled out; return the key so far and the camera."""
-    config = run.config
     if not is_sought(sequence, config):
         return key, known_camera(sequence, config)
-    stages = stage_key(key, config.camera, config.bundle_adjustment, config.windows.calibration_sightings)
+    limit = config.camera_init.max_depth_spread
+    stages = stage_key(key, config.camera, config.bundle_adjustment, config.windows.calibration_sightings, limit)
     # Without what users add to stages: the lens is found on some of the frames.
     found = run.step("lens", stages, lambda hooks: lens_step(sequence, labelled, config, hooks, run.recorder))
     camera = found_camera(found)
-    return key if camera.lens.is_pinhole and camera.zoom is None else stages, camera
+    return key if camera.is_plain else stages, camera
 
 
 def _stages(
     run: RunInProgress,
     key: str,
-    sequence: Sequence,
-    labelled: LabelledTracks,
-    config: Config,
+    inputs: StageInputs,
+    cameras: Arrays | None,
     windows: list[Window],
     run_stage: StageRunner,
     fragments: FragmentSearch | None,
     loops: LoopClosing | None,
     static: BegunControl,
 ) -> tuple[str, Arrays, Arrays]:
-    """Run stages 1 to 3, as one graph or in windows, and the joint solve.
+    """Run stages 2 and 3 from the first cameras, or all three in windows, and the joint solve.
 
     Returns:
         The key so far, and the records of the static scene and of what moves: both are that of the joint solve if there
         is one.
     """
     sources: tuple[FactorSource, ...] = run.sources if loops is None else (*run.sources, loops)
-    if windows:
+    sequence, labelled, config = inputs.sequence, inputs.labelled, inputs.config
+    if cameras is None:
         if config.joint.enabled:
             run.summary.warnings.append(NOT_IN_WINDOWS)
         run.forget("joint")
@@ -302,8 +313,6 @@ def _stages(
             if run.workers is not None:
                 static.begin(scene)  # while they solve windows this process is idle
             return key, scene, run.step("nonrigid", key, lambda hooks: motion_step(parts, scene, after, hooks))
-    cameras = run.step("camera_init", key, lambda hooks: camera_init_step(sequence, labelled, config, hooks, run_stage))
-    sequence, config, cameras, key = without_poor_depth(run, key, sequence, labelled, cameras, config)
     inertial = [] if run.imu is None else [config.imu, run.imu.digest()]
     key = stage_key(key, config.bundle_adjustment, *inertial, *fingerprints(sources))
     scene = run.step(

@@ -75,7 +75,12 @@ class _Fitted:
 
 
 def find_camera(
-    scene: GrowingScene, real: Observations, image_size: tuple[int, int], config: Config, grown: Grown
+    scene: GrowingScene,
+    real: Observations,
+    image_size: tuple[int, int],
+    config: Config,
+    grown: Grown,
+    proposed: MotionCamera | None = None,
 ) -> MotionCamera | None:
     """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom.
 
@@ -85,6 +90,7 @@ def find_camera(
         image_size: (height, width), px.
         config: Section ``camera``: which cameras to look for.
         grown: Grows a scene with another camera.
+        proposed: A camera from elsewhere: its zoom, if it has one, is tried whatever the scene asks for.
 
     Raises:
         Cancelled: If asked to stop.
@@ -95,11 +101,14 @@ def find_camera(
     if not part.good.any():
         return None
     plain = _Fitted(MotionCamera(part.intrinsics), part)
-    asks_for_zoom = _asks_for_zoom(plain, config)
+    starts = [proposed] if proposed is not None and proposed.zoom is not None else []
+    if _asks_for_zoom(plain, config):
+        log_ratio = similarities(scene.observations, len(scene.registered), image_size)
+        starts.append(MotionCamera(scene.prior_intrinsics, zoom=log_ratio - log_ratio.max()))
     asks_for_lens = settings.model == "auto" and (
         _joint(plain, "SIMPLE_RADIAL", config, _probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
-    if not (asks_for_zoom or asks_for_lens):
+    if not (starts or asks_for_lens):
         return None
     judge = _Judge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
     best = plain
@@ -107,8 +116,8 @@ def find_camera(
         lens = _find_lens(plain, judge, config)
         if _is_lens(lens.camera, image_size, config) and judge.better(lens, plain)[0] > 0.0:
             best = lens
-    if asks_for_zoom:
-        zoom = _find_zoom(plain, judge, scene, real, image_size, config, grown)
+    for start in starts:
+        zoom = _find_zoom(start, plain, judge, scene, real, config, grown)
         if zoom is not None and (settings.zoom == "on" or _is_zoom(zoom, plain, best, judge, config)):
             best = zoom
     return None if best is plain else best.camera
@@ -254,16 +263,14 @@ def _joint(start: _Fitted, model: LensModel, config: Config, options: dict[str, 
 
 
 def _find_zoom(
-    plain: _Fitted, judge: _Judge, scene: GrowingScene, real: Observations, image_size: tuple[int, int], config: Config,
+    camera: MotionCamera, plain: _Fitted, judge: _Judge, scene: GrowingScene, real: Observations, config: Config,
     grown: Grown,
 ) -> _Fitted | None:  # fmt: skip
-    """Grow scenes from tracks whose zoom is undone, and free what is left of it.
+    """Grow scenes from tracks whose zoom is undone, at first that of a camera to start from, and free what is left.
 
     None if no scene grows, or if after a round most tracks fit the camera that does not zoom better: of a zoom that is
     one, seven tenths or more fit it then.
     """
-    log_ratio = similarities(scene.observations, len(scene.registered), image_size)
-    camera = MotionCamera(scene.prior_intrinsics, zoom=log_ratio - log_ratio.max())
     settings = config.camera
     to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": _ZOOM_STEPS}
     found = None

@@ -86,6 +86,7 @@ def structure_from_motion(
     with_doubts: bool = True,
     camera: MotionCamera | None = None,
     any_camera: bool = False,
+    proposed: MotionCamera | None = None,
 ) -> Structure | None:
     """Find cameras and static points from tracks.
 
@@ -100,6 +101,7 @@ def structure_from_motion(
         with_doubts: Also look for what the tracks leave open; else there is one focal length and no rival.
         camera: A lens or a zoom that is known; None for a pinhole.
         any_camera: Also look for a lens and a zoom, as section ``camera`` says, where intrinsics are free.
+        proposed: Then also try the zoom of this camera.
 
     Returns:
         The structure, or None if no two frames have enough parallax to see depth.
@@ -125,7 +127,7 @@ def structure_from_motion(
         try:
             found = find_camera(
                 grown.scene, observations, image_size, config,
-                lambda ideal, known: None if (new := quiet.grow(ideal, known, False)) is None else new.scene,
+                lambda ideal, known: None if (new := quiet.grow(ideal, known, False)) is None else new.scene, proposed,
             )  # fmt: skip
         except SolverError:  # That of another camera is no reason to do without this one.
             found = None
