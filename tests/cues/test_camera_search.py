@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +112,17 @@ def test_a_search_that_fails_leaves_the_pinhole(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(motion, "find_camera", fail)
     assert structure(tracked(sideways(FRAMES))).camera.is_plain
+
+
+@pytest.mark.parametrize(("path", "is_told"), [(sideways, True), (forward, False)])
+def test_a_lens_is_not_believed_where_the_focal_length_is_open(
+    path: Callable[[int], np.ndarray], is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lens = MotionCamera(K, Lens("SIMPLE_RADIAL", (-0.02,)))
+    monkeypatch.setattr(motion, "find_camera", lambda *_: lens)
+    found = structure(tracked(path(FRAMES)))
+    assert found.focal.is_wide is not is_told
+    assert found.camera.lens.is_pinhole is not is_told
 
 
 def test_a_camera_that_is_known_is_not_looked_for() -> None:

@@ -433,7 +433,7 @@ class DenseMaps:
         log_scale = float(self.scene["log_scale"][frame])
         return fuse_static(
             judged.cue, measured, known, judged.errors.cue, judged.static, like_moving, log_scale, self.bleeding_px,
-            self.config,
+            self.config, frame in self.broken or self.sequence.depth_parallax is not None,
         )  # fmt: skip
 
     def _bleeding(self, frame: int, judged: _Judged, measured: Measured) -> float:

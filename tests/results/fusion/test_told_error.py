@@ -47,13 +47,13 @@ def test_where_the_cue_bleeds_depth_that_bends_between_two_surfaces_is_unsure() 
 
 @pytest.mark.parametrize(("share", "noise"), [(0.0, 0.003), (0.1, 0.004), (0.2, 0.008)])
 def test_the_error_is_told_from_landmarks_and_confidence(share: float, noise: float, rng: np.random.Generator) -> None:
-    """A part of the depth is off by 10 %, and said to be unsure; landmarks lie there three times as often."""
+    """A part of the depth is off by 10 %, and as unsure as that; landmarks lie there three times as often."""
     told, errors = ToldError(), []
     for _ in range(5):
         wrong = np.zeros(SHAPE, bool)
         wrong[:, : round(share * SHAPE[1])] = True
         off = np.where(wrong, 0.1, 0.0) + noise * rng.standard_normal(SHAPE)
-        confidence = np.where(wrong, 0.25, 0.985).astype(np.float32)
+        confidence = np.where(wrong, 0.1, 0.985).astype(np.float32)
         places = np.argwhere(rng.random(SHAPE) < np.where(wrong, 0.15, 0.05))
         uv = np.concatenate([places[:, ::-1], [[-3, 5], [500, 5]]]).astype(np.float64)
         told.add(off.astype(np.float32), confidence, np.ones(SHAPE, bool), uv, np.zeros(len(uv)))

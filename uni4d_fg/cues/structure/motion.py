@@ -135,7 +135,8 @@ def structure_from_motion(
         if found is not None:
             ideal = found.ideal_observations(observations)
             again = search.grow(ideal, found.intrinsics, free_focal)
-            if again is not None:
+            # Where tracks leave the focal length open, straight forward, they leave distortion open as well.
+            if again is not None and (found.lens.is_pinhole or not focal_interval(again.scene, image_size).is_wide):
                 grown, camera, observations = again, found, ideal
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)

@@ -26,7 +26,7 @@ _PER_CHANGE = 8.0
 """... and the cue is off by this many times what that changes, on scenes with truth."""
 _LEAST_RATIO = 0.5
 """A change by more is none of blurring."""
-_RAMP = 0.12
+_RAMP = 0.25
 """Change of log depth across which a cue that bleeds is a mixture."""
 
 

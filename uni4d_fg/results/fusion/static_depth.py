@@ -58,10 +58,14 @@ _EDGE = 0.1
 _LEAST_SIGMA = 0.003
 _UNCOMPARED_SIGMA = 0.1
 """Of a cue that nothing can be compared with."""
-_MIXED_RIGHT = 0.05
-"""Probability that a cue is right where it mixes two surfaces."""
+_MIXED_RIGHT = 0.3
+"""Probability that a cue is right where it mixes two surfaces ..."""
+_FOREIGN_RIGHT = 0.05
+"""... and the same of depth that was carried from other frames, or interpolated between points."""
+_FILLED_PX = 2.0
+"""Edges that are not the image's are taken from the nearest sure surface so far, working px."""
 _FILLED_RIGHT = 0.5
-"""Probability that the nearest sure surface is the right one."""
+"""Probability that the nearest surface is the right one."""
 _JUDGES = 0.5
 """Matched depth that is less reliable does not judge the cue."""
 
@@ -156,6 +160,7 @@ def fuse_static(
     default_log_scale: float,
     bleeding_px: float,
     config: FusionConfig,
+    foreign_edges: bool = False,
 ) -> StaticDepth:
     """Weigh the corrected cue and the depth from several views by their precision.
 
@@ -167,11 +172,11 @@ def fuse_static(
         static: (h, w) where nothing moves.
         like_moving: (h, w) what looks like a moving thing beside its mask.
         default_log_scale: Of the frame, where next to nothing is known.
-        bleeding_px: How far the cue bleeds across edges, working px: what it mixes is left to matching, and to the
-            nearest surface that is sure where matching says nothing.
+        bleeding_px: How far the cue bleeds across edges, working px: what it mixes is left to matching where that says
+            anything, and beside masks, where nothing is matched, to the nearest static surface.
         config: Fusion.
+        foreign_edges: The cue does not have the edges of this image: it is carried from other frames, or interpolated.
     """
-    shape = known.depth.weight.shape
     corrected = correct_cue(cue, known.depth, default_log_scale, config)
     if measured is None or known.reliability == 0.0:
         # The cue errs less where landmarks have corrected it, but frames are compared everywhere.
@@ -182,11 +187,11 @@ def fuse_static(
         return StaticDepth(corrected.log_depth, max(usual, _LANDMARK_SIGMA), sure, corrected, nothing)
     cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
     has_cue = np.isfinite(corrected.log_depth)
-    mixed = np.zeros(shape, dtype=bool)
+    mixed = np.zeros_like(static)
     if bleeding_px > 0:
         cue_sigma = np.hypot(cue_sigma, mixing_sigma(corrected.log_depth, bleeding_px))
-        mixed = across_edges(corrected.log_depth, bleeding_px) & ~like_moving
-        cue_right = np.where(mixed, np.minimum(cue_right, _MIXED_RIGHT), cue_right)
+        mixed = across_edges(corrected.log_depth, bleeding_px)
+        cue_right = np.where(mixed, np.minimum(cue_right, _FOREIGN_RIGHT if foreign_edges else _MIXED_RIGHT), cue_right)
     seen = measured.log_depth
     p = np.clip(known.reliability * measured.confidence, 1e-3, 1 - 1e-3)
     difference = np.where(has_cue, seen - np.where(has_cue, corrected.log_depth, 0), 0)
@@ -199,8 +204,13 @@ def fuse_static(
     gain = np.where(both > np.maximum(match_alone, cue_alone), gain, match_alone > cue_alone)
     gain = np.where(has_cue, gain, 1.0)
     log_depth = np.where(has_cue, np.where(has_cue, corrected.log_depth, 0) + gain * difference, seen)
-    filled = mixed & (p < _SURE)
-    log_depth = np.where(filled, from_nearest(log_depth.astype(np.float32), static & ~filled), log_depth)
+    filled, source = mixed & ~static, static
+    if foreign_edges and mixed.any():
+        unsure = mixed & (p < _SURE)
+        source = static & ~unsure
+        filled |= unsure & (cv2.distanceTransform((~source).astype(np.uint8), cv2.DIST_L2, 5) <= _FILLED_PX)
+    filled &= ~like_moving
+    log_depth = np.where(filled, from_nearest(log_depth.astype(np.float32), source), log_depth)
     sigma = np.hypot((1 - gain) * cue_sigma, gain * matched)
     # What the explanation that was chosen has of all, and the depth of the others would be wrong.
     chosen = np.maximum(both, np.maximum(match_alone, cue_alone))

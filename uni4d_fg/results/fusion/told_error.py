@@ -30,10 +30,10 @@ _MOST_BENT = np.float32(0.015)
 _BESIDE_WINDOW = np.ones((3, 3), np.uint8)
 _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
 _SURENESS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0], np.float32)
-_ERRORS = np.array([0.2, 0.09, 0.045, 0.024, 0.0125, 0.0045, 0.0025], np.float32)
+_ERRORS = np.array([0.16, 0.05, 0.029, 0.0155, 0.0095, 0.0045, 0.0025], np.float32)
 """Mean errors at these probabilities, linear in between: of clips of two renderers, from the video alone and with cues
 as networks make them."""
-_PRIOR_SHARE = 0.7
+_PRIOR_SHARE = 0.8
 """Of what is told, in the logarithm, that such errors have; the rest is the landmarks'."""
 _MIN_COMPARED = 10
 
