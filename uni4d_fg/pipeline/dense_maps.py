@@ -18,6 +18,7 @@ from uni4d_fg.results.fusion.background import Background, View, background
 from uni4d_fg.results.fusion.bleeding import bleeding_radius
 from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
+from uni4d_fg.results.fusion.guided_median import guided_median
 from uni4d_fg.results.fusion.lifting import lifted
 from uni4d_fg.results.fusion.mask_band import STILL, looks_moving, stands_still
 from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_poor, is_preferred, tells_bleeding
@@ -260,8 +261,9 @@ class DenseMaps:
             filled = np.where(shown, -np.log(np.where(shown, behind.inverse, np.float32(1))), filled)
         sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
         sure[~mine.unmasked & (mine.depth.matched <= STILL)] = 0
-        log_depth = self.size.shown(filled)
+        log_depth, sure = self.size.shown(filled), self.size.shown(self.size.continued(sure))
         if frame in self.broken or self.bleeding_px:
+            log_depth = guided_median(log_depth, sure, self.size.shown(mine.static), self.sequence.images[frame])
             full = np.exp(upsample_guided(log_depth, self.sequence.images[frame]))
             full[np.isnan(given)] = np.nan
         else:
@@ -271,7 +273,6 @@ class DenseMaps:
             if still is not None:
                 moving &= self.size.plain.enlarge(still.astype(np.float32)) <= _HALF
             full[moving] = np.exp(self._moving(frame, given, mask)[moving])
-        sure = self.size.shown(self.size.continued(sure))
         return full, FinalStatic(log_depth, sure, self.size.shown(mine.unmasked))
 
     def _averaged(self, frame: int) -> Averaged:

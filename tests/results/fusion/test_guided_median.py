@@ -1,0 +1,58 @@
+"""Edges of depth that is not sure are those of the image."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uni4d_fg.results.fusion.guided_median import guided_median
+
+SHAPE = (40, 60)
+EVERYWHERE = np.ones(SHAPE, bool)
+
+
+def two_surfaces(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Log depth of a thing before a wall, and an image twice as large in which they have colors of their own."""
+    near = np.zeros(SHAPE, bool)
+    near[10:30, 20:40] = True
+    large = np.kron(near, np.ones((2, 2), bool))
+    image = np.where(large[..., None], [180, 60, 60], [60, 90, 170]) + rng.normal(0, 4, (*large.shape, 3))
+    return np.where(near, np.log(2.0), np.log(3.0)).astype(np.float32), np.clip(image, 0, 255).astype(np.uint8)
+
+
+def test_a_mixture_beside_an_edge_becomes_the_surface_that_it_looks_like(rng: np.random.Generator) -> None:
+    truth, image = two_surfaces(rng)
+    depth, sure = truth.copy(), np.full(SHAPE, 0.95, np.float32)
+    band = np.zeros(SHAPE, bool)
+    band[7:33, 17:43] = True
+    band[13:27, 23:37] = False
+    depth[band], sure[band] = np.log(2.4), 0.05
+    found = guided_median(depth, sure, EVERYWHERE, image)
+    np.testing.assert_array_equal(found[~band], depth[~band])
+    wrong = np.abs(found - truth)[band] > 0.01
+    assert wrong.mean() < 0.02
+    left = band & (np.arange(SHAPE[1]) < 30)
+    np.testing.assert_array_equal(guided_median(depth, sure, ~left, image)[left], depth[left])
+
+
+def test_nothing_is_changed_where_depth_is_sure_and_nothing_made_where_it_is_missing(rng: np.random.Generator) -> None:
+    truth, image = two_surfaces(rng)
+    np.testing.assert_array_equal(guided_median(truth, np.full(SHAPE, 0.6, np.float32), EVERYWHERE, image), truth)
+    missing = truth.copy()
+    missing[5:20, 5:30] = np.nan
+    found = guided_median(missing, np.zeros(SHAPE, np.float32), EVERYWHERE, image)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(missing))
+
+
+@given(seed=st.integers(0, 2**16), side=st.integers(1, 12))
+@settings(max_examples=25, deadline=None)
+def test_depth_stays_among_what_is_there(seed: int, side: int) -> None:
+    """Whatever the size and the holes: every depth is one of those around, as no mean is taken."""
+    rng = np.random.default_rng(seed)
+    depth = rng.normal(1.0, 0.5, (side, 2 * side)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.3] = np.nan
+    image = rng.integers(0, 256, (3 * side, 6 * side, 3), dtype=np.uint8)
+    found = guided_median(depth, rng.random(depth.shape).astype(np.float32), np.ones(depth.shape, bool), image)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(depth))
+    assert np.isin(found[np.isfinite(found)], depth[np.isfinite(depth)]).all()

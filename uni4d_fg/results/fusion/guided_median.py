@@ -1,0 +1,63 @@
+"""Edges of depth brought to those of the image, where depth is not sure: a weighted median.
+
+A pixel that is not sure takes the median of the depths around, weighted by how near they are, by how much their color
+is like its own, and by how sure they are (Ma et al. 2013, "Constant time weighted median filtering for stereo matching
+and beyond"). Unlike a mean, a median of two surfaces is one of them.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
+
+_UNSURE = 0.5
+"""Pixels of a lower confidence are replaced."""
+_REACH_PX, _STEP_PX = 4, 2
+"""Every second pixel of a window of this half side is looked at."""
+_SPATIAL_PX = 3.0
+"""Standard deviation of the weights by distance ..."""
+_COLOR = 0.05
+"""... and of those by color, of 1."""
+_LEAST = np.float32(1e-3)
+"""Weight of depth that is not sure at all, beside that of sure depth."""
+_FARTHEST = np.float32(60.0)
+"""Exponent beyond which pixels are equally unlike."""
+
+
+def guided_median(
+    log_depth: Float32Array, confidence: Float32Array, static: BoolArray, image: ImageArray
+) -> Float32Array:
+    """Return log depth (h, w) with what is not sure taken from what looks alike around it.
+
+    Args:
+        log_depth: (h, w), NaN where missing; stays missing there.
+        confidence: (h, w) probability that it is right.
+        static: (h, w) where that may be done: masks may be smaller than what moves, and what is beside them is left.
+        image: (H, W, 3) RGB, not smaller.
+    """
+    height, width = log_depth.shape
+    known = np.isfinite(log_depth)
+    row, column = np.nonzero(known & static & (confidence < _UNSURE))
+    if not row.size:
+        return log_depth
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    color = small.reshape(-1, 3).astype(np.float32) / np.float32(255 * np.sqrt(2.0) * _COLOR)
+    weight = np.where(known, confidence + _LEAST, np.float32(0)).ravel()
+    depth, own = np.where(known, log_depth, np.float32(0)).ravel(), color[row * width + column]
+    taps = range(-_REACH_PX, _REACH_PX + 1, _STEP_PX)
+    values = np.empty((len(taps) ** 2, row.size), np.float32)
+    weights = np.empty_like(values)
+    for number, (dy, dx) in enumerate((dy, dx) for dy in taps for dx in taps):
+        inside = (row + dy >= 0) & (row + dy < height) & (column + dx >= 0) & (column + dx < width)
+        at = np.where(inside, (row + dy) * width + column + dx, 0)
+        unlike = ((color[at] - own) ** 2).sum(axis=1) + np.float32((dy * dy + dx * dx) / (2 * _SPATIAL_PX**2))
+        values[number] = depth[at]
+        weights[number] = np.where(inside, weight[at] * np.exp(-np.minimum(unlike, _FARTHEST)), np.float32(0))
+    order = np.argsort(values, axis=0)
+    mass = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+    middle = np.argmax(mass >= 0.5 * mass[-1:], axis=0)
+    out = log_depth.copy()
+    out[row, column] = values[order[middle, np.arange(row.size)], np.arange(row.size)]
+    return out
