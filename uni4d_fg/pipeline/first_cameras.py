@@ -25,7 +25,7 @@ from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry import se3
-from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens
+from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.fingerprint import stage_key
@@ -231,12 +231,13 @@ def _scale(observations: Observations, world_T_cam: FloatArray, points: FloatArr
 
 def _found_camera(found: Arrays, sequence: Sequence) -> CameraModel:
     """Return the lens and the zoom of the record of :func:`_structure_step`."""
-    number, parameters, log_zoom = int(found["camera"][0]), found["camera"][1:5], found["camera"][5:]
-    lens = Lens.of(list(PARAMETERS)[number], parameters)
-    if lens.is_pinhole and not len(log_zoom):
+    from uni4d_fg.cues.structure.motion_camera import MotionCamera
+
+    camera = MotionCamera.of_array(found["camera"], found["intrinsics"])
+    if camera.is_plain:
         return CameraModel(PINHOLE, sequence.intrinsics)
-    zoom = np.exp(log_zoom) if len(log_zoom) else None
-    return CameraModel(lens, found["intrinsics"], zoom, float(found["focal_sigma"]))
+    zoom = None if camera.zoom is None else np.exp(camera.zoom)
+    return CameraModel(camera.lens, camera.intrinsics, zoom, float(found["focal_sigma"]))
 
 
 def _with_known_cameras(inputs: StageInputs, found: Arrays) -> StageInputs:

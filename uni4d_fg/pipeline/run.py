@@ -210,16 +210,15 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
         key = stage_key(key, repeats.solved.tolist())
     judging = settings_of_judgment(config, sequence, depth_is_needed=not alone)
     key, camera = _camera(run, key, solved, solved_tracks, judging)
-    begun = None
+    key, poses = stage_key(key, sequence.focal_sigma), None
     if windows:
         inputs = StageInputs.of(solved, solved_tracks, camera, config, depth_is_needed=True)
-        key = stage_key(key, sequence.focal_sigma)
     else:
-        begun = first_cameras(
-            run, stage_key(key, sequence.focal_sigma), solved, solved_tracks, camera, run_stage,
-            is_sought=is_sought(solved, config), depth_is_needed=not alone,
+        first = first_cameras(
+            run, key, solved, solved_tracks, camera, run_stage, is_sought=is_sought(solved, config),
+            depth_is_needed=not alone,
         )  # fmt: skip
-        camera, inputs, key = begun.camera, begun.inputs, begun.key
+        camera, inputs, poses, key = first.camera, first.inputs, first.poses, first.key
     fragments = FragmentSearch.of(solved, solved_tracks, config.bundle_adjustment.rejoin)
     loops = loop_closing(solved, camera, config)
     if loops is not None:
@@ -231,7 +230,6 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
             labelled, scene, zoomed(scene["intrinsics"], zoom, sequence.num_frames), config.fusion
         )
     )
-    poses = None if begun is None else begun.poses
     key, scene, motion = _stages(run, key, inputs, poses, windows, run_stage, fragments, loops, static)
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)

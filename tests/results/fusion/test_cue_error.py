@@ -35,6 +35,17 @@ def room(rng: np.random.Generator, scale: float = 1.2, shift: float = 0.05) -> t
     return depth.astype(np.float32), cue.astype(np.float32)
 
 
+def step() -> np.ndarray:
+    """Depth of a surface at 2 m on the left, and one at 3 m behind it on the right."""
+    return np.where(np.arange(WIDTH) < 40, 2.0, 3.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
+
+
+def landmarks(log_depth: np.ndarray, where: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and log depth of landmarks on a fifth of the pixels ``where`` there may be some."""
+    places = np.argwhere((rng.random(log_depth.shape) < 0.2) & where)
+    return places[:, ::-1].astype(np.float64), log_depth[places[:, 0], places[:, 1]].astype(np.float64)
+
+
 def test_an_affine_fit_bears_outliers(rng: np.random.Generator) -> None:
     depth = rng.uniform(1.0, 5.0, 400)
     cue = 1.25 / (1.0 / depth - 0.04)
@@ -141,8 +152,7 @@ def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(
     depth, cue = room(rng)
     truth = np.log(depth).astype(np.float64)
     static, sigma = np.ones(depth.shape, bool), np.full(depth.shape, 0.004, np.float32)
-    places = np.argwhere(rng.random(depth.shape) < 0.2)
-    uv, log_z = places[:, ::-1].astype(np.float64), truth[places[:, 0], places[:, 1]]
+    uv, log_z = landmarks(truth, ~NOWHERE, rng)
     noisy = (cue * np.exp(0.03 * rng.standard_normal(depth.shape))).astype(np.float32)
     for error, better in ((0.005, True), (0.1, False)):
         seen = np.exp(truth + error * rng.standard_normal(truth.shape)).astype(np.float32)
@@ -184,7 +194,7 @@ def test_matched_depth_that_is_sure_wins_over_a_cue_that_is_wrong_and_says_so(rn
 
 def test_matched_depth_leaves_the_edges_to_a_cue_that_has_them(rng: np.random.Generator) -> None:
     """A step from 2 to 3 m: the cue has it where it is, with an error beside; matching has blurred it."""
-    depth = np.where(np.arange(WIDTH) < 40, 2.0, 3.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
+    depth = step()
     cue = (depth * np.exp(0.01 * rng.standard_normal(depth.shape))).astype(np.float32)
     blurred = cv2.GaussianBlur(depth, (0, 0), 2.0)
     measured = Measured(
@@ -197,8 +207,7 @@ def test_matched_depth_leaves_the_edges_to_a_cue_that_has_them(rng: np.random.Ge
     beside = np.zeros(depth.shape, bool)
     beside[:, 37:43] = True
     errors = {}
-    places = np.argwhere((rng.random(depth.shape) < 0.2) & ~beside)
-    uv, log_z = places[:, ::-1].astype(np.float64), np.log(depth[places[:, 0], places[:, 1]]).astype(np.float64)
+    uv, log_z = landmarks(np.log(depth), ~beside, rng)
     for name, matched in (("as it is", measured), ("without edges", said)):
         known = known_depth(matched, uv, log_z, np.ones(depth.shape, bool), (HEIGHT, WIDTH))
         fused = fuse_static(cue, matched, known, 0.01, ~NOWHERE, NOWHERE, 0.0, 0.0, FusionConfig())
@@ -209,14 +218,13 @@ def test_matched_depth_leaves_the_edges_to_a_cue_that_has_them(rng: np.random.Ge
 
 def test_what_a_cue_mixes_is_taken_from_matching(rng: np.random.Generator) -> None:
     """A step from 2 to 3 m that the cue has blurred; matching has it, half sure, but for a strip beside it."""
-    depth = np.where(np.arange(WIDTH) < 40, 2.0, 3.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
+    depth = step()
     cue = cv2.GaussianBlur(depth, (0, 0), 3.0)
     sure = np.full(depth.shape, 0.97, np.float32)
     sure[:, 36:41], sure[:, 41:44] = 0.5, 0.2
     seen = np.where(sure > 0.4, depth, np.float32(5.0)).astype(np.float32)
     measured = Measured(np.log(seen), sure, np.full(depth.shape, 0.004, np.float32))
-    places = np.argwhere((rng.random(depth.shape) < 0.2) & (np.abs(np.arange(WIDTH) - 40) > 8))
-    uv, log_z = places[:, ::-1].astype(np.float64), np.log(depth[places[:, 0], places[:, 1]]).astype(np.float64)
+    uv, log_z = landmarks(np.log(depth), np.abs(np.arange(WIDTH) - 40) > 8, rng)
     known = known_depth(measured, uv, log_z, ~NOWHERE, (HEIGHT, WIDTH))
     errors, told = {}, {}
     for bleeding_px in (0.0, 6.0):
@@ -230,14 +238,33 @@ def test_what_a_cue_mixes_is_taken_from_matching(rng: np.random.Generator) -> No
     assert (told[6.0] <= 0.5).all()
 
 
+def test_a_mixture_beside_a_mask_is_the_nearest_static_surface_unless_it_looks_like_what_moves(
+    rng: np.random.Generator,
+) -> None:
+    """A step that the cue has blurred, with a strip behind a mask on its far side, where nothing is matched."""
+    depth = step()
+    cue = cv2.GaussianBlur(depth, (0, 0), 3.0)
+    static = np.broadcast_to((np.arange(WIDTH) < 41) | (np.arange(WIDTH) >= 44), depth.shape)
+    sure = np.where(static, np.float32(0.97), np.float32(0))
+    measured = Measured(np.log(depth), sure, np.full(depth.shape, 0.004, np.float32))
+    uv, log_z = landmarks(np.log(depth), np.abs(np.arange(WIDTH) - 40) > 8, rng)
+    known = known_depth(measured, uv, log_z, static, (HEIGHT, WIDTH))
+    errors = {}
+    for looks_like_it in (False, True):
+        like_moving = ~static & looks_like_it
+        fused = fuse_static(cue, measured, known, 0.01, static, like_moving, 0.0, 6.0, FusionConfig())
+        errors[looks_like_it] = np.abs(fused.log_depth - np.log(depth))[:, 41:44]
+    assert errors[False].max() < 0.02
+    assert errors[True].mean() > 0.05
+
+
 def test_matching_need_not_be_as_sure_where_edges_are_of_other_frames(rng: np.random.Generator) -> None:
-    depth = np.where(np.arange(WIDTH) < 40, 2.0, 3.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
+    depth = step()
     cue = np.roll(depth, 3, axis=1)  # the edge has moved
     sure = np.full(depth.shape, 0.97, np.float32)
     sure[:, 36:44] = 0.15
     measured = Measured(np.log(depth), sure, np.full(depth.shape, 0.004, np.float32))
-    places = np.argwhere((rng.random(depth.shape) < 0.2) & (np.abs(np.arange(WIDTH) - 40) > 8))
-    uv, log_z = places[:, ::-1].astype(np.float64), np.log(depth[places[:, 0], places[:, 1]]).astype(np.float64)
+    uv, log_z = landmarks(np.log(depth), np.abs(np.arange(WIDTH) - 40) > 8, rng)
     known = known_depth(measured, uv, log_z, ~NOWHERE, (HEIGHT, WIDTH))
     errors = {}
     for foreign in (False, True):
@@ -256,8 +283,7 @@ def test_ground_that_goes_to_the_horizon_is_no_mixture(rng: np.random.Generator)
     sure[:6] = 0.2
     seen = np.where(sure > 0.5, truth, truth - 0.5).astype(np.float32)
     measured = Measured(seen, sure, np.full(truth.shape, 0.004, np.float32))
-    places = np.argwhere((rng.random(truth.shape) < 0.2) & (np.arange(HEIGHT)[:, None] > 6))
-    uv, log_z = places[:, ::-1].astype(np.float64), truth[places[:, 0], places[:, 1]].astype(np.float64)
+    uv, log_z = landmarks(truth, np.arange(HEIGHT)[:, None] > 6, rng)
     known = known_depth(measured, uv, log_z, ~NOWHERE, (HEIGHT, WIDTH))
     fused = fuse_static(cue, measured, known, 0.02, ~NOWHERE, NOWHERE, 0.0, 6.0, FusionConfig())
     assert np.abs(fused.log_depth - truth)[:6].mean() < 0.05

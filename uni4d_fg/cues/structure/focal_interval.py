@@ -106,15 +106,9 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
         SolverError: If bundle adjustment fails.
     """
     focal = float(np.mean(scene.intrinsics[:2]))
-    stage, state, frames, rows = scene.bundle()
-    if not stage.problem.is_free(INTRINSICS):
+    deviation, noise = _deviation(scene, image_size)
+    if deviation == 0.0:
         return FocalInterval(focal, focal)
-    independent = scene.focal_deviation()
-    noise = _noise(scene, stage, state, frames, rows, image_size)
-    if np.isfinite(independent):
-        noise = max(noise, (clustered_deviation(scene, stage, state) / independent) ** 2)
-    noise *= _SHARED**2
-    deviation = independent * np.sqrt(noise)
     if deviation <= OPEN_FOCAL_SIGMA:  # as far as that E(f) is as good as quadratic
         ends = focal * np.exp(np.array([-1.96, 1.96]) * deviation)
         return FocalInterval(float(ends[0]), float(ends[1]), deviation=deviation)
@@ -124,6 +118,24 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
     low, low_is_open = profile.end(-step, float(limits[0]))
     high, high_is_open = profile.end(step, float(limits[1]))
     return FocalInterval(focal * np.exp(low), focal * np.exp(high), low_is_open, high_is_open, deviation)
+
+
+def focal_is_open(scene: GrowingScene, image_size: tuple[int, int]) -> bool:
+    """Return whether :func:`focal_interval` would be wide, without looking for its ends. Raises as it does."""
+    return not _deviation(scene, image_size)[0] <= OPEN_FOCAL_SIGMA
+
+
+def _deviation(scene: GrowingScene, image_size: tuple[int, int]) -> tuple[float, float]:
+    """Return the standard deviation of log f, 0 where it is held, and the noise in units of what is assumed."""
+    stage, state, frames, rows = scene.bundle()
+    if not stage.problem.is_free(INTRINSICS):
+        return 0.0, 1.0
+    independent = scene.focal_deviation()
+    noise = _noise(scene, stage, state, frames, rows, image_size)
+    if np.isfinite(independent):
+        noise = max(noise, (clustered_deviation(scene, stage, state) / independent) ** 2)
+    noise *= _SHARED**2
+    return independent * float(np.sqrt(noise)), noise
 
 
 class _Profile:

@@ -13,7 +13,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.camera_search import find_camera
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
-from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
+from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval, focal_is_open
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import CONVERGED, grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
@@ -136,7 +136,7 @@ def structure_from_motion(
             ideal = found.ideal_observations(observations)
             again = search.grow(ideal, found.intrinsics, free_focal)
             # Where tracks leave the focal length open, straight forward, they leave distortion open as well.
-            if again is not None and (found.lens.is_pinhole or not focal_interval(again.scene, image_size).is_wide):
+            if again is not None and (found.lens.is_pinhole or not focal_is_open(again.scene, image_size)):
                 grown, camera, observations = again, found, ideal
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)

@@ -210,7 +210,8 @@ def fuse_static(
         source = static & ~unsure
         filled |= unsure & (cv2.distanceTransform((~source).astype(np.uint8), cv2.DIST_L2, 5) <= _FILLED_PX)
     filled &= ~like_moving
-    log_depth = np.where(filled, from_nearest(log_depth.astype(np.float32), source), log_depth)
+    if filled.any():
+        log_depth = np.where(filled, from_nearest(log_depth.astype(np.float32), source), log_depth)
     sigma = np.hypot((1 - gain) * cue_sigma, gain * matched)
     # What the explanation that was chosen has of all, and the depth of the others would be wrong.
     chosen = np.maximum(both, np.maximum(match_alone, cue_alone))

@@ -165,9 +165,11 @@ def calibrate_lens(
 def _left_to_tracks(fit: LensFit, scene: StaticScene, config: Config) -> str:
     """Say so where depths contradict each other by much more than a lens makes them: it is then found without them."""
     limit = config.camera_init.max_depth_spread
+    if limit is None:
+        return ""
     static = observations_of(fit.tracks, TrackLabel.STATIC, TrackLabel.SHORT_STATIC)
     spread = depth_spread(static, scene.cameras)
-    if limit is None or not spread > _FAR_BEYOND * limit:
+    if not spread > _FAR_BEYOND * limit:
         return ""
     return f"no distortion was sought beside depths that depart by {100 * spread:.0f} % from frame to frame"
 
