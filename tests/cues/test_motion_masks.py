@@ -19,7 +19,6 @@ from uni4d_fg.cues.moving_regions import trusted_components
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.track_motion import Cameras, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
@@ -30,6 +29,7 @@ from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.alignment import align_trajectories
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
+from uni4d_fg.slam.lens.camera_model import CameraModel
 
 INTRINSICS = np.array([200.0, 210.0, 79.5, 59.5])
 
@@ -127,7 +127,7 @@ def test_evidence_of_pixels(rng: np.random.Generator) -> None:
     near = np.full((120, 160), 2.0, np.float32)
     near[20:60, 100:140] = 1.0  # something else in front
     zero = np.zeros((120, 160), np.float32)
-    pixels = PixelGrid.of(MotionCamera(INTRINSICS), (120, 160), (120, 160))
+    pixels = PixelGrid.of(CameraModel(INTRINSICS), (120, 160), (120, 160))
 
     def evidence(second: np.ndarray, depth: np.ndarray, pose: np.ndarray, edge_px: int = 1) -> np.ndarray:
         first, other = (

@@ -21,7 +21,6 @@ from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_ma
 from uni4d_fg.cues.plan import CuePlan, CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.cues.start_doubts import doubts_of_masks
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.bars import without_bars
@@ -32,6 +31,7 @@ from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.optim.threads import on_one_blas_thread
 from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.slam.lens.camera_model import CameraModel
 
 _LESS_PARALLAX = 0.6
 """By which factor less parallax is enough once some was seen: what moved is masked then, and had its share in it."""
@@ -100,9 +100,9 @@ class _Gathering:
         self.intrinsics_of_motion: FloatArray | None = None
         self.world_T_cam = video.initial_world_T_cam
         self.cameras_of_motion: FloatArray | None = None
-        self.camera: MotionCamera | None = None
+        self.camera: CameraModel | None = None
         if not video.lens.is_pinhole and video.intrinsics is not None:
-            self.camera = MotionCamera(video.intrinsics, video.lens)
+            self.camera = CameraModel(video.intrinsics, video.lens)
             # They belong to the lens.
             self.config = config.model_copy(update={"input": config.input.model_copy(update={"intrinsics": "fixed"})})
         self.moving_tracks: BoolArray | None = None
@@ -274,7 +274,7 @@ class _Gathering:
         self.report.warnings += warnings
         return masks
 
-    def _known_camera(self) -> MotionCamera | None:
+    def _known_camera(self) -> CameraModel | None:
         """Return a lens or a zoom that needs not be looked for; None lets the tracks tell.
 
         A lens that was found among things that move is looked for again once they are masked: they can mimic one. A
@@ -284,9 +284,9 @@ class _Gathering:
         known = camera is not None and (camera.zoom is not None or not self.video.lens.is_pinhole)
         return camera if known else None
 
-    def _best_camera(self) -> MotionCamera:
+    def _best_camera(self) -> CameraModel:
         """Return what is known of the camera so far, its lens and zoom too."""
-        camera = self.camera or MotionCamera(self._best_intrinsics())
+        camera = self.camera or CameraModel(self._best_intrinsics())
         return replace(camera, intrinsics=self._best_intrinsics())
 
     def _best_intrinsics(self) -> FloatArray:
@@ -303,7 +303,7 @@ class _Gathering:
     def _zoom(self) -> FloatArray | None:
         """Return the focal length of each frame over the longest (T,); None where the camera does not zoom."""
         zoom = None if self.camera is None else self.camera.zoom
-        return self.video.zoom if zoom is None else np.exp(zoom)
+        return self.video.zoom if zoom is None else zoom
 
     def _key(self) -> str:
         if self._video_key is None:

@@ -32,7 +32,6 @@ from uni4d_fg.cues.structure.motion import (
     rotations_only,
     structure_from_motion,
 )
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
@@ -40,6 +39,7 @@ from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
 
 _SPHERE_STEP = 16
@@ -54,7 +54,7 @@ class GeometricDepth:
     """T maps (H, W), in the unit of the result; every pixel has a value."""
     world_T_cam: FloatArray
     """(T, 4, 4); the first camera is the world."""
-    camera: MotionCamera
+    camera: CameraModel
     """Intrinsics, lens and zoom."""
     sparse: Float32Array
     """(K, T) depth of every static observation that is triangulated well, NaN elsewhere."""
@@ -88,7 +88,7 @@ def depth_from_motion(
     reporter: Reporter | None = None,
     should_stop: Callable[[], bool] | None = None,
     with_doubts: bool = True,
-    camera: MotionCamera | None = None,
+    camera: CameraModel | None = None,
 ) -> GeometricDepth:
     """Find cameras and up-to-scale depth from tracks of the static scene.
 
@@ -128,7 +128,7 @@ def depth_from_motion(
         camera=camera, any_camera=camera is None,
     )  # fmt: skip
     if structure is None:
-        ideal = camera or MotionCamera(intrinsics)
+        ideal = camera or CameraModel(intrinsics)
         observations = ideal.ideal_observations(observations)
         return _without_parallax(video, tracks, is_static, observations, ideal, config.geometric_depth)
     return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
@@ -282,7 +282,7 @@ def _without_parallax(
     tracks: Tracks,
     is_static: BoolArray,
     observations: Observations,
-    camera: MotionCamera,
+    camera: CameraModel,
     config: GeometricDepthConfig,
 ) -> GeometricDepth:
     """Return depth for a camera that stays in one place: a sphere around it, which a rotation does not change."""

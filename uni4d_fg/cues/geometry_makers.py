@@ -19,13 +19,13 @@ from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.interpolated_depth import GridDepths, InterpolatedDepths
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import MaskFolder
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter
+from uni4d_fg.slam.lens.camera_model import CameraModel
 
 ShouldStop = Callable[[], bool]
 
@@ -33,7 +33,7 @@ _RECORD = "start"
 
 
 def geometric_depth(
-    video: Video, tracks: Tracks, is_static: BoolArray, intrinsics: FloatArray, camera: MotionCamera | None,
+    video: Video, tracks: Tracks, is_static: BoolArray, intrinsics: FloatArray, camera: CameraModel | None,
     images_key: str, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
 ) -> GeometricDepth:  # fmt: skip
     """Find depth from the motion of the camera, unless it is there already.
@@ -89,7 +89,7 @@ def geometric_depth(
         depths = GridDepths(tuple(stored["grids"].astype(np.float32)), video.image_size, target.name)
     else:
         depths = FloatMaps(tuple(cache.map_path(name) for name in names), video.image_size)
-    camera = MotionCamera.of_array(stored["camera"], stored["intrinsics"])
+    camera = CameraModel.of_array(stored["camera"], stored["intrinsics"])
     return GeometricDepth(
         depths, stored["world_T_cam"], camera, stored["sparse"].astype(np.float32), stored["moving"],
         bool(stored["has_parallax"][0]), float(stored["focal_sigma"][0]), tuple(facts), tuple(warnings), start,
@@ -114,7 +114,7 @@ def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> di
 
 
 def moving_masks(
-    video: Video, depths: FrameSource[Float32Array], tracks: Tracks, camera: MotionCamera, images_key: str,
+    video: Video, depths: FrameSource[Float32Array], tracks: Tracks, camera: CameraModel, images_key: str,
     depth_key: str, moving: BoolArray | None, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
 ) -> tuple[MaskFolder, list[str], list[str]]:  # fmt: skip
     """Find what moves, unless that is there already; ``moving`` (K,) are tracks of which it is known.
@@ -172,7 +172,7 @@ def masks_key(video: Video) -> str:
     return digest.hexdigest()
 
 
-def _camera_key(camera: MotionCamera | None) -> str:
+def _camera_key(camera: CameraModel | None) -> str:
     return "" if camera is None or camera.is_plain else _digest(camera.to_array())
 
 

@@ -38,13 +38,13 @@ from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.static_scene import relative_pose
 from uni4d_fg.cues.structure.motion import observations_of_tracks, structure_from_motion
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.track_motion import QuadraticGrid, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.optim.threads import OrderedMap, thread_count, workers_in_order
 from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
 
 _MOST_MAY_MOVE = 0.6
@@ -75,7 +75,7 @@ def motion_masks(
     should_stop: Callable[[], bool] | None = None,
     solver: Config | None = None,
     known_moving: BoolArray | None = None,
-    camera: MotionCamera | None = None,
+    camera: CameraModel | None = None,
 ) -> MotionMasks:
     """Find what moves in a video by comparing it with a static scene.
 
@@ -103,7 +103,7 @@ def motion_masks(
         if count != video.num_frames:
             raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
-    camera = camera or MotionCamera(intrinsics)
+    camera = camera or CameraModel(intrinsics)
     ideal = camera.ideal_tracks(tracks)
     if known_moving is None:
         known_moving = _contradicting(ideal, video.image_size, intrinsics, settings, report, stop)
@@ -151,7 +151,7 @@ def _tracks_and_cameras(
     depths: FrameSource[Float32Array],
     tracks: Tracks,
     ideal: Tracks,
-    camera: MotionCamera,
+    camera: CameraModel,
     known_moving: BoolArray,
     config: MotionMaskConfig,
     settings: Config,
@@ -218,7 +218,7 @@ class _Comparison:
         depths: FrameSource[Float32Array],
         tracks: Tracks,
         cameras: Cameras,
-        camera: MotionCamera,
+        camera: CameraModel,
         motion: TrackMotion,
         config: MotionMaskConfig,
     ) -> None:

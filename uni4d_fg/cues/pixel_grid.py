@@ -8,17 +8,17 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.cues.static_scene import StaticPrediction, predict_static_at
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.track_motion import SharedError
 from uni4d_fg.factors.zoom import zoomed_intrinsics
 from uni4d_fg.frontend.sequence.resize import scale_intrinsics
+from uni4d_fg.slam.lens.camera_model import CameraModel
 
 
 @dataclass(frozen=True)
 class PixelGrid:
     """All pixels of images of one size."""
 
-    camera: MotionCamera
+    camera: CameraModel
     """Of that size."""
     columns: Float32Array
     """Of the pixels, or of the ideal ones of a lens, of a shape that NumPy broadcasts to (h, w)."""
@@ -27,7 +27,7 @@ class PixelGrid:
     """(2,) pixels per pixel of the images, x and y."""
 
     @classmethod
-    def of(cls, camera: MotionCamera, size: tuple[int, int], image_size: tuple[int, int]) -> PixelGrid:
+    def of(cls, camera: CameraModel, size: tuple[int, int], image_size: tuple[int, int]) -> PixelGrid:
         """Return the grid of images of (h, w) ``size``, of a camera whose images have ``image_size``."""
         scale = np.array([size[1] / image_size[1], size[0] / image_size[0]])
         intrinsics = scale_intrinsics(camera.intrinsics, image_size, size)
@@ -58,7 +58,7 @@ class PixelGrid:
         Through a lens they are taken as they are: that they are squeezed there matters less than that they are known.
         """
         (cx, cy), zoom = self.camera.intrinsics[2:], self.camera.zoom
-        shrunk, grown = (1.0, 1.0) if zoom is None else (np.exp(-zoom[source]), np.exp(zoom[target]))
+        shrunk, grown = (1.0, 1.0) if zoom is None else (1.0 / zoom[source], zoom[target])
         u, v = (
             (center + (at - center) * shrunk + 0.5) / scale - 0.5
             for at, center, scale in ((self.columns, cx, self.scale[0]), (self.rows, cy, self.scale[1]))
@@ -68,4 +68,6 @@ class PixelGrid:
 
     def _intrinsics(self, frame: int) -> FloatArray:
         intrinsics, zoom = self.camera.intrinsics, self.camera.zoom
-        return intrinsics if zoom is None else np.asarray(zoomed_intrinsics(intrinsics, zoom[frame : frame + 1]))
+        return (
+            intrinsics if zoom is None else np.asarray(zoomed_intrinsics(intrinsics, np.log(zoom[frame : frame + 1])))
+        )

@@ -25,16 +25,16 @@ from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry import se3
-from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.fingerprint import stage_key
 from uni4d_fg.pipeline.in_progress import RunInProgress
-from uni4d_fg.pipeline.lens import CameraModel
+from uni4d_fg.pipeline.lens import as_pinhole
 from uni4d_fg.pipeline.steps import STOPPED, Arrays, camera_init_step
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.warnings import focal_warnings
 from uni4d_fg.progress import Reporter
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.lifting import frame_log_scales
 from uni4d_fg.slam.stages.observations import Observations, observations_of
 
@@ -61,7 +61,7 @@ class StageInputs:
 
         ``depth_is_needed`` says whether the run relies on the depth cue for the scale of the world.
         """
-        ideal, tracks, settings = camera.apply(sequence, labelled, config)
+        ideal, tracks, settings = as_pinhole(camera, sequence, labelled, config)
         return cls(ideal, tracks, settings_behind_lens(settings, sequence, depth_is_needed=depth_is_needed))
 
 
@@ -167,7 +167,6 @@ def _structure_step(
     # Hundreds of milliseconds to load, and most runs need nothing of it.
     from uni4d_fg.cues.start_doubts import start_doubts, start_summary
     from uni4d_fg.cues.structure.motion import structure_from_motion
-    from uni4d_fg.cues.structure.motion_camera import MotionCamera
 
     spread = float(cameras["depth_spread"])
     said = f"depths of static points depart by {100 * spread:.0f} % from frame to frame"
@@ -176,14 +175,11 @@ def _structure_step(
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(2)
     if len(np.unique(static.track)) < config.geometric_depth.min_pose_points:
         return StageRecord(kept, {"facts": [f"{said}; cameras are found with them all the same, as tracks are few"]})
-    proposed = None
-    if beside_cue is not None and beside_cue.zoom is not None:
-        proposed = MotionCamera(beside_cue.intrinsics, zoom=np.log(beside_cue.zoom))
     try:
         found = structure_from_motion(
             replace(static, weight=np.ones(len(static)), depth=np.full(len(static), np.nan)),
             labelled.tracks.num_frames, sequence.image_size, sequence.intrinsics, config, _Steps(reporter),
-            hooks.should_stop or (lambda: False), any_camera=beside_cue is not None, proposed=proposed,
+            hooks.should_stop or (lambda: False), any_camera=beside_cue is not None, proposed=beside_cue,
         )  # fmt: skip
     except Cancelled as error:
         raise Cancelled(STOPPED) from error
@@ -231,13 +227,10 @@ def _scale(observations: Observations, world_T_cam: FloatArray, points: FloatArr
 
 def _found_camera(found: Arrays, sequence: Sequence) -> CameraModel:
     """Return the lens and the zoom of the record of :func:`_structure_step`."""
-    from uni4d_fg.cues.structure.motion_camera import MotionCamera
-
-    camera = MotionCamera.of_array(found["camera"], found["intrinsics"])
+    camera = CameraModel.of_array(found["camera"], found["intrinsics"])
     if camera.is_plain:
-        return CameraModel(PINHOLE, sequence.intrinsics)
-    zoom = None if camera.zoom is None else np.exp(camera.zoom)
-    return CameraModel(camera.lens, camera.intrinsics, zoom, float(found["focal_sigma"]))
+        return CameraModel(sequence.intrinsics)
+    return replace(camera, focal_sigma=float(found["focal_sigma"]))
 
 
 def _with_known_cameras(inputs: StageInputs, found: Arrays) -> StageInputs:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled, ConfigError, DegenerateProblemError, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens
+from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.steps import STOPPED
@@ -22,44 +21,24 @@ from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.pipeline.warnings import focal_warnings
 from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
-from uni4d_fg.slam.lens.tracks import ideal_tracks, unzoomed_tracks
+from uni4d_fg.slam.lens.camera_model import CameraModel
 
 
-@dataclass(frozen=True)
-class CameraModel:
-    """What stages take for known of the camera."""
+def as_pinhole(
+    camera: CameraModel, sequence: Sequence, labelled: LabelledTracks, config: Config
+) -> tuple[Sequence, LabelledTracks, Config]:
+    """Return what the stages solve: the sequence and tracks of a pinhole that does not zoom.
 
-    lens: Lens
-    intrinsics: FloatArray
-    """(4,) px, of the longest focal length."""
-    zoom: FloatArray | None = None
-    """(T,) focal length of each frame over that one; None where the camera does not zoom."""
-    focal_sigma: float | None = None
-    """Standard deviation of the log focal length where camera motion told it with the rest; else None."""
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether it is a pinhole that does not zoom."""
-        return self.lens.is_pinhole and self.zoom is None
-
-    def apply(
-        self, sequence: Sequence, labelled: LabelledTracks, config: Config
-    ) -> tuple[Sequence, LabelledTracks, Config]:
-        """Return what the stages solve: the sequence and tracks of a pinhole that does not zoom.
-
-        Intrinsics are held, as lens and zoom are theirs; those of a zoom are of its longest focal length.
-        """
-        if self.is_plain:
-            return sequence, labelled, config
-        ideal = ideal_tracks(labelled, self.intrinsics, self.lens)
-        if self.zoom is not None:
-            ideal = unzoomed_tracks(ideal, self.intrinsics, np.log(self.zoom))
-        held = config.input.model_copy(update={"intrinsics": "fixed"})
-        return (
-            replace(sequence, intrinsics=self.intrinsics, focal_sigma=self.focal_sigma, lens=PINHOLE, zoom=None),
-            ideal,
-            config.model_copy(update={"input": held}),
-        )
+    Intrinsics are held, as lens and zoom are theirs; those of a zoom are of its longest focal length.
+    """
+    if camera.is_plain:
+        return sequence, labelled, config
+    held = config.input.model_copy(update={"intrinsics": "fixed"})
+    return (
+        replace(sequence, intrinsics=camera.intrinsics, focal_sigma=camera.focal_sigma, lens=PINHOLE, zoom=None),
+        camera.ideal_labelled(labelled),
+        config.model_copy(update={"input": held}),
+    )
 
 
 def is_sought(sequence: Video | Sequence, config: Config) -> bool:
@@ -92,7 +71,7 @@ def known_camera(sequence: Sequence, config: Config) -> CameraModel:
     """Return the camera of a sequence whose lens is not estimated. Raises ConfigError as :func:`check_camera`."""
     check_camera(sequence, config)
     lens = PINHOLE if config.camera.model == "pinhole" else sequence.lens
-    return CameraModel(lens, sequence.intrinsics, sequence.zoom, sequence.focal_sigma)
+    return CameraModel(sequence.intrinsics, lens, sequence.zoom, sequence.focal_sigma)
 
 
 def check_camera(sequence: Video | Sequence, config: Config) -> None:
@@ -141,16 +120,10 @@ def lens_step(
         found = LensCalibration(PINHOLE, sequence.intrinsics, note=f"no distortion was sought: {error}")
     except Cancelled as error:
         raise Cancelled(STOPPED) from error
-    arrays = {
-        "model": np.array([list(PARAMETERS).index(found.lens.model)]),
-        "parameters": found.lens.padded,
-        "intrinsics": found.intrinsics,
-    }
     zoom = found.zoom
-    if zoom is not None and zoom.zoom is not None:
-        arrays["zoom"] = zoom.zoom
+    camera = CameraModel(found.intrinsics, found.lens, None if zoom is None else zoom.zoom)
     # A pinhole's move on in bundle adjustment, which has its own look at them; those of a zoom are no single ones.
-    alone = not found.lens.is_pinhole and "zoom" not in arrays
+    alone = not camera.lens.is_pinhole and camera.zoom is None
     doubts = focal_warnings(sequence.intrinsics, found.intrinsics[:2]) if alone else []
     summary: dict[str, Any] = {
         "solves": [solve_dict(solve) for solve in found.solves],
@@ -175,10 +148,9 @@ def lens_step(
             "focal_sigma": zoom.open_by if np.isfinite(zoom.open_by) else None,
             "focal_px": None if zoom.zoom is None else (zoom.intrinsics[0] * zoom.zoom).tolist(),
         }
-    return StageRecord(arrays, summary)
+    return StageRecord({"camera": camera.to_array(), "intrinsics": camera.intrinsics}, summary)
 
 
-def found_camera(arrays: Mapping[str, npt.NDArray[Any]]) -> CameraModel:
+def found_camera(record: Mapping[str, npt.NDArray[Any]]) -> CameraModel:
     """Return the camera of a record of :func:`lens_step`."""
-    model = list(PARAMETERS)[int(arrays["model"][0])]
-    return CameraModel(Lens.of(model, arrays["parameters"]), arrays["intrinsics"], arrays.get("zoom"))
+    return CameraModel.of_array(record["camera"], record["intrinsics"])

@@ -9,9 +9,10 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LOG_SCALE, POSE
 from uni4d_fg.frontend.sequence.model import Sequence
-from uni4d_fg.pipeline.lens import CameraModel, known_camera
+from uni4d_fg.pipeline.lens import known_camera
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.slam.incremental.results import Finished
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.loops.closing import LoopClosing
 from uni4d_fg.slam.loops.pose_graph import close_path
 

@@ -53,7 +53,7 @@ from uni4d_fg.pipeline.in_progress import MUCH, RunInProgress
 from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
-from uni4d_fg.pipeline.lens import CameraModel, found_camera, is_sought, known_camera, lens_step
+from uni4d_fg.pipeline.lens import found_camera, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.loops import loop_closing, with_loops
 from uni4d_fg.pipeline.measurements import MeasurementFiles, Measurements, read_measurements
 from uni4d_fg.pipeline.repeats import Repeats
@@ -72,6 +72,7 @@ from uni4d_fg.results.labels_io import load_labels, save_labels
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.association.fragments import FragmentSearch
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.loops.closing import LoopClosing
 from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.windows.plan import Window, windows_of

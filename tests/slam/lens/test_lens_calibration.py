@@ -28,7 +28,7 @@ from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental import IncrementalReconstructor
 from uni4d_fg.slam.incremental.model import FrameTracks
 from uni4d_fg.slam.lens.calibration import LensCandidate, calibrate_lens, is_taken
-from uni4d_fg.slam.lens.tracks import ideal_tracks
+from uni4d_fg.slam.lens.camera_model import CameraModel
 
 pytest.importorskip("open3d")
 
@@ -83,14 +83,14 @@ def test_ideal_tracks_are_those_of_the_pinhole(barrel: Sequence) -> None:
     truth = barrel.ground_truth.intrinsics
     assert truth is not None
     real = labelled(barrel)
-    ideal = ideal_tracks(real, truth, Lens("SIMPLE_RADIAL", (-0.2,)))
+    ideal = CameraModel(truth, Lens("SIMPLE_RADIAL", (-0.2,))).ideal_labelled(real)
     straight = scene(PINHOLE)
     assert straight.tracks is not None
     # The same surface points are not tracked, but a straight line of the room is straight again: radii grow.
     radius = [np.linalg.norm(t.tracks.uv[t.weight > 0] - truth[2:], axis=1) for t in (real, ideal)]
     assert radius[1].max() > 1.1 * radius[0].max()
     assert (ideal.weight <= real.weight).all()
-    assert ideal_tracks(real, truth, PINHOLE) is real
+    assert CameraModel(truth).ideal_labelled(real) is real
 
 
 def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_path: Path) -> None:

@@ -33,8 +33,8 @@ from uni4d_fg.results.residuals import reprojection_residuals
 from uni4d_fg.results.run import Run
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import LensFit
-from uni4d_fg.slam.lens.tracks import unzoomed_tracks
 
 pytest.importorskip("open3d")
 
@@ -189,7 +189,7 @@ def test_unzoomed_tracks_are_those_of_one_focal_length() -> None:
     ratio = ramp(FRAMES)
     real, zoomed = labelled(sequence), labelled(zoom_sequence(sequence, ratio))
     longest = sequence.intrinsics * [1.6, 1.6, 1.0, 1.0]
-    ideal = unzoomed_tracks(zoomed, longest, np.log(ratio / ratio.max()))
+    ideal = CameraModel(longest, zoom=ratio / ratio.max()).ideal_labelled(zoomed)
     seen = zoomed.tracks.visible
     expected = longest[2:] + 1.6 * (real.tracks.uv[: len(seen)] - longest[2:])
     if len(real.label) == len(zoomed.label):

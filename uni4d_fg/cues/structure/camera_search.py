@@ -25,7 +25,6 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.factors.state import State
@@ -35,6 +34,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.problems import RealPixels, is_far, lens_problem, zoom_problem
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.observations import Observations
@@ -68,7 +68,7 @@ _SIGHTINGS = 4
 class _Fitted:
     """A camera that was fitted, and the poses that go with it."""
 
-    camera: MotionCamera
+    camera: CameraModel
     scene: GrowingScene
     evidence: float = 0.0
     """Part of the reprojection energy that setting the camera free took away."""
@@ -80,8 +80,8 @@ def find_camera(
     image_size: tuple[int, int],
     config: Config,
     grown: Grown,
-    proposed: MotionCamera | None = None,
-) -> MotionCamera | None:
+    proposed: CameraModel | None = None,
+) -> CameraModel | None:
     """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom.
 
     Args:
@@ -100,11 +100,11 @@ def find_camera(
     part = _part_of(scene, settings.observations)
     if not part.good.any():
         return None
-    plain = _Fitted(MotionCamera(part.intrinsics), part)
+    plain = _Fitted(CameraModel(part.intrinsics), part)
     starts = [proposed] if proposed is not None and proposed.zoom is not None else []
     if _asks_for_zoom(plain, config):
         log_ratio = similarities(scene.observations, len(scene.registered), image_size)
-        starts.append(MotionCamera(scene.prior_intrinsics, zoom=log_ratio - log_ratio.max()))
+        starts.append(CameraModel(scene.prior_intrinsics, zoom=np.exp(log_ratio - log_ratio.max())))
     asks_for_lens = settings.model == "auto" and (
         _joint(plain, "SIMPLE_RADIAL", config, _probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
@@ -193,19 +193,19 @@ def _asks_for_zoom(plain: _Fitted, config: Config) -> bool:
         return False  # Tracks are too short for so many frames, and nothing would be known of the rest.
     probe = _free_zoom(plain, config, _probing(config))
     assert probe.camera.zoom is not None
-    moves = float(np.ptp(probe.camera.zoom)) >= _PROBED * settings.min_zoom
+    moves = float(np.ptp(np.log(probe.camera.zoom))) >= _PROBED * settings.min_zoom
     return probe.evidence >= settings.min_zoom_evidence and moves
 
 
 def _is_zoom(zoom: _Fitted, plain: _Fitted, best: _Fitted, judge: _Judge, config: Config) -> bool:
     """Tell whether the focal length changes enough, for most tracks, and explains all together better than the best."""
-    settings, log_focal = config.camera, zoom.camera.zoom
-    if log_focal is None or float(np.expm1(np.ptp(log_focal))) < settings.min_zoom:
+    settings, ratio = config.camera, zoom.camera.zoom
+    if ratio is None or ratio.max() / ratio.min() - 1.0 < settings.min_zoom:
         return False
     return judge.better(zoom, plain)[1] >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0
 
 
-def _is_lens(camera: MotionCamera, image_size: tuple[int, int], config: Config) -> bool:
+def _is_lens(camera: CameraModel, image_size: tuple[int, int], config: Config) -> bool:
     settings, lens = config.camera, camera.lens
     if is_far(lens, settings):
         return False
@@ -216,7 +216,7 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     """Fit one radial parameter from the best of several starts, and a second one where that takes energy away."""
     starts = []
     for k1 in config.camera.starts:
-        camera = MotionCamera(plain.camera.intrinsics, Lens("SIMPLE_RADIAL", (k1,)))
+        camera = CameraModel(plain.camera.intrinsics, Lens("SIMPLE_RADIAL", (k1,)))
         try:
             scene = _scene_of(camera.ideal_observations(judge.real), plain.scene)
             scene.adjust()
@@ -259,11 +259,11 @@ def _joint(start: _Fitted, model: LensModel, config: Config, options: dict[str, 
     found = state[OPENCV_CAMERA][0]
     evidence = (before.final_energy - after.final_energy) / max(before.final_energies["static_reprojection"], 1e-300)
     scene = bundle.moved(start.scene, state, found[:4])
-    return _Fitted(MotionCamera(scene.intrinsics, Lens.of(model, found[4:])), scene, evidence)
+    return _Fitted(CameraModel(scene.intrinsics, Lens.of(model, found[4:])), scene, evidence)
 
 
 def _find_zoom(
-    camera: MotionCamera, plain: _Fitted, judge: _Judge, scene: GrowingScene, real: Observations, config: Config,
+    camera: CameraModel, plain: _Fitted, judge: _Judge, scene: GrowingScene, real: Observations, config: Config,
     grown: Grown,
 ) -> _Fitted | None:  # fmt: skip
     """Grow scenes from tracks whose zoom is undone, at first that of a camera to start from, and free what is left.
@@ -285,7 +285,7 @@ def _find_zoom(
         assert found.camera.zoom is not None
         if settings.zoom == "auto" and judge.better(found, plain)[1] < 0.5:
             return None
-        settled = float(np.ptp(found.camera.zoom - camera.zoom)) < _SETTLED
+        settled = float(np.ptp(np.log(found.camera.zoom / camera.zoom))) < _SETTLED
         camera = found.camera
         if settled:
             break
@@ -315,7 +315,7 @@ def similarities(observations: Observations, num_frames: int, image_size: tuple[
 def _free_zoom(start: _Fitted, config: Config, options: dict[str, float]) -> _Fitted:
     """Free a focal length per frame, beside that which was undone."""
     bundle = _Bundle.of(start.scene)
-    ideal = bundle.pixels(MotionCamera(start.scene.intrinsics), config)
+    ideal = bundle.pixels(CameraModel(start.scene.intrinsics), config)
     problem, state = zoom_problem(
         bundle.state, bundle.stage.problem.batches, ideal, bundle.frames, config.bundle_adjustment, config.camera
     )
@@ -324,13 +324,13 @@ def _free_zoom(start: _Fitted, config: Config, options: dict[str, float]) -> _Fi
     state, after = _solve(problem, state, solver, start.scene.should_stop)
     every = np.arange(len(start.scene.registered))
     zoom = np.interp(every, bundle.frames, state[ZOOM][:, 0])
-    zoom = zoom if start.camera.zoom is None else zoom + start.camera.zoom
+    zoom = zoom if start.camera.zoom is None else zoom + np.log(start.camera.zoom)
     intrinsics = state[INTRINSICS][0].copy()
     longest = float(zoom.max())
     intrinsics[:2] *= np.exp(longest)
     evidence = (after.initial_energy - after.final_energy) / max(before, 1e-300)
     scene = bundle.moved(start.scene, state, intrinsics)
-    return _Fitted(MotionCamera(intrinsics, zoom=zoom - longest), scene, evidence)
+    return _Fitted(CameraModel(intrinsics, zoom=np.exp(zoom - longest)), scene, evidence)
 
 
 @dataclass(frozen=True)
@@ -351,7 +351,7 @@ class _Bundle:
         sigma = scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px
         return cls(stage, state, frames, scene.used()[0], sigma)
 
-    def pixels(self, camera: MotionCamera, config: Config) -> RealPixels:
+    def pixels(self, camera: CameraModel, config: Config) -> RealPixels:
         """Return the observations as a camera has them whose ideal pixels they are at."""
         used, frame = self.used, np.searchsorted(self.frames, self.used.frame)
         weight = used.weight / camera.ideal_weight(used.uv, used.frame)

@@ -17,7 +17,6 @@ from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import CONVERGED, grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
-from uni4d_fg.cues.structure.motion_camera import MotionCamera
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
@@ -26,6 +25,7 @@ from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -35,7 +35,7 @@ class Structure:
 
     world_T_cam: FloatArray
     """(T, 4, 4)."""
-    camera: MotionCamera
+    camera: CameraModel
     """Intrinsics, lens and zoom; errors, noise and focal lengths are those of its ideal pixels."""
     registered: BoolArray
     """(T,) False for frames that are bridged."""
@@ -84,9 +84,9 @@ def structure_from_motion(
     reporter: Reporter,
     should_stop: Callable[[], bool],
     with_doubts: bool = True,
-    camera: MotionCamera | None = None,
+    camera: CameraModel | None = None,
     any_camera: bool = False,
-    proposed: MotionCamera | None = None,
+    proposed: CameraModel | None = None,
 ) -> Structure | None:
     """Find cameras and static points from tracks.
 
@@ -116,7 +116,7 @@ def structure_from_motion(
         raise Cancelled("structure from motion stopped")
     search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop)
     if camera is None or camera.is_plain:
-        camera = MotionCamera(intrinsics)
+        camera = CameraModel(intrinsics)
     observations = camera.ideal_observations(observations)
     grown = search.grow(observations, camera.intrinsics, free_focal)
     if grown is None:

@@ -17,7 +17,7 @@ from uni4d_fg.frontend.tracks.depth_sampling import sample_depth
 from uni4d_fg.frontend.tracks.mask_certainty import UNCERTAIN, certain_labels
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.slam.incremental.model import FrameTracks
-from uni4d_fg.slam.lens.tracks import ideal_weight
+from uni4d_fg.slam.lens.camera_model import CameraModel
 
 UNKNOWN, REJECTED = -1, -2
 
@@ -42,12 +42,13 @@ class LabelledFrame:
     """Tracks that turned out to be unreliable in this frame."""
 
     def ideal(self, lens: Lens, intrinsics: FloatArray) -> LabelledFrame:
-        """Return the observations on the ideal pixels of a lens; see :func:`uni4d_fg.slam.lens.tracks.ideal_tracks`."""
+        """Return the observations on the ideal pixels of a lens; see :class:`CameraModel`."""
         if lens.is_pinhole:
             return self
-        uv = lens.ideal_pixels(intrinsics, self.uv)
+        camera, frame = CameraModel(intrinsics, lens), np.zeros(len(self.uv), dtype=np.int64)
+        uv = camera.ideal(self.uv, frame)
         seen = np.isfinite(uv).all(axis=1)
-        weight = self.weight[seen] * ideal_weight(lens, intrinsics, uv[seen])
+        weight = self.weight[seen] * camera.ideal_weight(uv[seen], frame[seen])
         return LabelledFrame(self.track[seen], uv[seen], self.depth[seen], weight, self.label[seen], self.rejected)
 
     def select(self, static: bool) -> LabelledFrame:

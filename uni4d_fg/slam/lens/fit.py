@@ -19,8 +19,8 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.problems import RealPixels, lens_family, lens_problem
-from uni4d_fg.slam.lens.tracks import ideal_tracks, ideal_weight, unzoomed_tracks
 from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
@@ -88,7 +88,7 @@ class LensFit:
             SolverError: If a system is singular or a cue is not finite.
         """
         solver = StaticSceneSolver(self.config, self.run, self.hooks)
-        ideal = ideal_tracks(self.tracks, intrinsics, lens)
+        ideal = CameraModel(intrinsics, lens).ideal_labelled(self.tracks)
         found = solver.solve(ideal, intrinsics, self.prior_intrinsics, free_intrinsics=True)
         self.note(found.solves)
         return found
@@ -191,7 +191,7 @@ class LensFit:
         _, row = seen.rows()
         real = self.tracks.tracks.uv[seen.track, seen.frame].astype(np.float64)
         # Those of stage 2, drift included, without what ideal pixels lose.
-        weight = seen.weight / ideal_weight(lens, scene.cameras.intrinsics, seen.uv)
+        weight = seen.weight / CameraModel(scene.cameras.intrinsics, lens).ideal_weight(seen.uv, seen.frame)
         sigma = scene.noise.reprojection_sigma_px
         noise = MAP.observed(sigma, weight, ba.reprojection_kernel, seen.frame, len(pinhole[POSE]))
         return lens_problem(
@@ -230,9 +230,8 @@ class HeldOut:
     def energies(self, fit: FittedLens) -> FloatArray:
         """Triangulate the tracks under frozen cameras; return each one's robust energy per observation, NaN if lost."""
         cameras, ba = fit.scene.cameras, self.config.bundle_adjustment
-        ideal = ideal_tracks(self.tracks, cameras.intrinsics, fit.lens)
-        if fit.zoom is not None:
-            ideal = unzoomed_tracks(ideal, cameras.intrinsics, fit.zoom)
+        zoom = None if fit.zoom is None else np.exp(fit.zoom)
+        ideal = CameraModel(cameras.intrinsics, fit.lens, zoom).ideal_labelled(self.tracks)
         seen = observations_of(ideal, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(3)
         tracks, row = seen.rows()
         landmarks = mean_per_row(lift(seen, cameras), seen.weight, row, len(tracks))

@@ -15,9 +15,9 @@ from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit
 from uni4d_fg.slam.lens.problems import RealPixels, zoom_problem
-from uni4d_fg.slam.lens.tracks import unzoomed_tracks
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.scene import Cameras, StaticScene
@@ -72,7 +72,7 @@ class ZoomFit:
             DegenerateProblemError: If the cues do not determine the cameras.
             SolverError: If a system is singular or a cue is not finite.
         """
-        tracks = unzoomed_tracks(self.more_tracks, start.intrinsics, start.zoom)
+        tracks = CameraModel(start.intrinsics, zoom=np.exp(start.zoom)).ideal_labelled(self.more_tracks)
         fit = replace(self.fit, tracks=tracks)
         left = replace(self, fit=fit).solve(fit.scene(PINHOLE, start.intrinsics))
         zoom, intrinsics = start.zoom + left.zoom, left.intrinsics.copy()

@@ -1,4 +1,4 @@
-"""A camera that motion alone tells: intrinsics, distortion, and the focal length of every frame."""
+"""What is known of a camera, and what a pinhole in its place would have seen."""
 
 from __future__ import annotations
 
@@ -7,21 +7,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
-from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
 from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens
-from uni4d_fg.slam.lens.tracks import ideal_weight
 from uni4d_fg.slam.stages.observations import Observations
 
 
 @dataclass(frozen=True)
-class MotionCamera:
-    """A pinhole, or one with radial distortion, or one that zooms."""
+class CameraModel:
+    """A pinhole, or a camera with a lens that distorts, or one that zooms.
+
+    Cameras are solved on ideal pixels: those of a pinhole that does not zoom, with the same intrinsics.
+    """
 
     intrinsics: FloatArray
     """(4,) px, of the longest focal length."""
     lens: Lens = PINHOLE
     zoom: FloatArray | None = None
-    """(T,) log focal length of each frame over that of the intrinsics, not positive; None where it does not zoom."""
+    """(T,) focal length of each frame over that one; None where the camera does not zoom."""
+    focal_sigma: float | None = None
+    """Standard deviation of the log focal length where camera motion told it with the rest; else None."""
 
     @property
     def is_plain(self) -> bool:
@@ -29,24 +33,29 @@ class MotionCamera:
         return self.lens.is_pinhole and self.zoom is None
 
     def ideal(self, uv: FloatArray, frame: IntArray) -> FloatArray:
-        """Return where the pinhole of the longest focal length shows what is seen at pixels (N, 2) of frames (N,)."""
+        """Return where the pinhole shows what is seen at pixels (N, 2) of frames (N,); NaN where no direction is."""
         uv = self.lens.ideal_pixels(self.intrinsics, uv)
         if self.zoom is None:
             return uv
         center = self.intrinsics[2:]
-        return center + (uv - center) * np.exp(-self.zoom[frame])[:, None]
+        return center + (uv - center) / self.zoom[frame][:, None]
 
     def real(self, ideal: FloatArray, frame: IntArray) -> FloatArray:
-        """Return where the images of frames (N,) show what that pinhole shows at pixels (N, 2)."""
+        """Return where the images of frames (N,) show what the pinhole shows at pixels (N, 2)."""
         if self.zoom is not None:
             center = self.intrinsics[2:]
-            ideal = center + (ideal - center) * np.exp(self.zoom[frame])[:, None]
+            ideal = center + (ideal - center) * self.zoom[frame][:, None]
         return self.lens.real_pixels(self.intrinsics, ideal)
 
     def ideal_weight(self, ideal: FloatArray, frame: IntArray) -> FloatArray:
-        """Return the factor (N,) on weights: by which area of the image a pixel of that pinhole is seen."""
-        weight = ideal_weight(self.lens, self.intrinsics, ideal)
-        return weight if self.zoom is None else weight * np.exp(2.0 * self.zoom[frame])
+        """Return the factor (N,), in (0, 1], on weights of observations at ideal pixels (N, 2) of frames (N,).
+
+        Where the lens squeezes the image, or the focal length is shorter, an ideal pixel is less sure than a real one:
+        by the area of the image on which it is seen, which is what the noise of a pixel then is in the pinhole.
+        """
+        with np.errstate(invalid="ignore"):
+            weight: FloatArray = np.clip(self.lens.magnification(self.intrinsics, ideal), 1e-6, 1.0)
+        return weight if self.zoom is None else weight * self.zoom[frame] ** 2
 
     def ideal_observations(self, real: Observations) -> Observations:
         """Return observations at their ideal pixels; those that no direction reaches are left out."""
@@ -57,7 +66,7 @@ class MotionCamera:
         return moved.select(np.asarray(np.isfinite(uv).all(axis=1)))
 
     def ideal_tracks(self, tracks: Tracks) -> Tracks:
-        """Return tracks at their ideal pixels."""
+        """Return tracks at their ideal pixels; what no direction reaches counts as not visible."""
         if self.is_plain:
             return tracks
         track, frame = np.nonzero(tracks.visible)
@@ -68,8 +77,18 @@ class MotionCamera:
         uv[~visible] = np.nan
         return replace(tracks, uv=uv, visible=visible)
 
-    def with_intrinsics(self, intrinsics: FloatArray) -> MotionCamera:
-        """Return the camera with other intrinsics (4,) and the same ideal pixels.
+    def ideal_labelled(self, labelled: LabelledTracks) -> LabelledTracks:
+        """Return labelled tracks at their ideal pixels, with the weights that they have there."""
+        if self.is_plain:
+            return labelled
+        tracks, weight = self.ideal_tracks(labelled.tracks), np.zeros_like(labelled.weight)
+        track, frame = np.nonzero(tracks.visible)
+        there = self.ideal_weight(tracks.uv[track, frame].astype(np.float64), frame)
+        weight[track, frame] = labelled.weight[track, frame] * there
+        return replace(labelled, tracks=tracks, weight=weight)
+
+    def with_intrinsics(self, intrinsics: FloatArray) -> CameraModel:
+        """Return the camera with other intrinsics (4,) and the same ideal pixels; its lens has radial terms only.
 
         These are at ``f x (1 + k1 r^2 + ..)``, r = |x| in a plane at distance one: with f another, the same r in
         pixels is another |x|, so that k1 grows with f^2 and k2 with f^4.
@@ -88,7 +107,7 @@ class MotionCamera:
                 f"camera model {self.lens.model}, " + ", ".join(f"{name} {value:.4f}" for name, value in values)
             )
         if self.zoom is not None:
-            focal = self.intrinsics[0] * np.exp(self.zoom)
+            focal = self.intrinsics[0] * self.zoom
             said.append(f"the camera zooms: fx from {focal.min():.1f} to {focal.max():.1f} px")
         return said
 
@@ -98,7 +117,7 @@ class MotionCamera:
         return np.concatenate([[list(PARAMETERS).index(self.lens.model)], self.lens.padded, zoom])
 
     @classmethod
-    def of_array(cls, array: FloatArray, intrinsics: FloatArray) -> MotionCamera:
+    def of_array(cls, array: FloatArray, intrinsics: FloatArray) -> CameraModel:
         """Return what :meth:`to_array` returned of a camera with intrinsics (4,)."""
         lens = Lens.of(list(PARAMETERS)[int(array[0])], array[1:5])
         return cls(intrinsics, lens, array[5:] if len(array) > 5 else None)
