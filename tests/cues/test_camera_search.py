@@ -12,7 +12,7 @@ from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, t
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.structure import motion
-from uni4d_fg.cues.structure.camera_search import similarities
+from uni4d_fg.cues.structure.camera_search import is_lens, similarities
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
 from uni4d_fg.cues.track_motion import QuadraticGrid, SharedError
 from uni4d_fg.errors import SolverError
@@ -109,6 +109,16 @@ def test_a_search_that_fails_leaves_the_pinhole(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(motion, "find_camera", fail)
     assert structure(tracked(sideways(FRAMES))).camera.is_plain
+
+
+@pytest.mark.parametrize(
+    ("k1", "gain", "is_one"),
+    [(0.02, 0.005, False), (0.02, 0.02, True), (-0.12, 0.001, True), (-0.12, -0.001, False), (0.001, 0.5, False)],
+)
+def test_a_weak_lens_must_gain_more_than_errors_of_a_tracker(k1: float, gain: float, is_one: bool) -> None:
+    """Pixels move by 2.3 px at most through k1 = 0.02, and by 18 px, a twentieth of the width, through -0.12."""
+    camera = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
+    assert is_lens(camera, SIZE, gain, load_config("default", [])) is is_one
 
 
 @pytest.mark.parametrize(("path", "is_told"), [(sideways, True), (forward, False)])

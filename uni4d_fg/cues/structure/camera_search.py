@@ -114,7 +114,7 @@ def find_camera(
     best = plain
     if asks_for_lens:
         lens = _find_lens(plain, judge, config)
-        if _is_lens(lens.camera, image_size, config) and judge.better(lens, plain)[0] > 0.0:
+        if is_lens(lens.camera, image_size, judge.better(lens, plain)[0], config):
             best = lens
     for start in starts:
         zoom = _find_zoom(start, plain, judge, scene, real, config, grown)
@@ -205,11 +205,16 @@ def _is_zoom(zoom: _Fitted, plain: _Fitted, best: _Fitted, judge: _Judge, config
     return judge.better(zoom, plain)[1] >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0
 
 
-def _is_lens(camera: CameraModel, image_size: tuple[int, int], config: Config) -> bool:
+def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, config: Config) -> bool:
+    """Tell whether a lens bends the image enough, for what it gains: errors of a tracker mimic a weak one."""
     settings, lens = config.camera, camera.lens
     if is_far(lens, settings):
         return False
-    return settings.min_displacement_px < lens.displacement(camera.intrinsics, image_size) < np.inf
+    displacement = lens.displacement(camera.intrinsics, image_size)
+    if not settings.min_displacement_px < displacement < np.inf:
+        return False
+    unsure = displacement < settings.sure_displacement * max(image_size)
+    return gain >= settings.min_evidence_unsure if unsure else gain > 0.0
 
 
 def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
