@@ -249,7 +249,8 @@ def test_a_rotation_leaves_little_whatever_the_guess(factor: float) -> None:
     a, b = CommonTracks(seen, 2).between(0, 1)
     assert len(a) > 50
     left = parallax(seen.uv[a], seen.uv[b], K * np.array([factor, factor, 1.0, 1.0]), known_focal=False)
-    assert left < 0.8
+    assert left.median < 0.8
+    assert left.upper < 1.2
 
 
 def test_a_camera_that_only_turns_has_no_structure_at_the_focal_length_that_is_found() -> None:

@@ -161,7 +161,7 @@ def _with_maps(
     fx, fy = structure.intrinsics[:2]
     facts = (
         f"structure from motion started from frames {structure.pair.first} and {structure.pair.second} "
-        f"(parallax {structure.pair.parallax_px:.0f} px); {int(structure.registered.sum())} of {video.num_frames} "
+        f"(parallax {structure.pair.parallax.median:.0f} px); {int(structure.registered.sum())} of {video.num_frames} "
         f"frames posed, {triangulated} of {len(structure.track)} static tracks triangulated, "
         f"noise {structure.sigma_px:.2f} px, fx {fx:.1f} fy {fy:.1f} px",
         *structure.camera.facts(),

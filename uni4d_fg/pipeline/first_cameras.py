@@ -170,11 +170,10 @@ def _structure_step(
 
     spread = float(cameras["depth_spread"])
     said = f"depths of static points depart by {100 * spread:.0f} % from frame to frame"
-    kept = {name: cameras[name] for name in ("world_T_cam", "intrinsics")}
     sequence, labelled, config = seen.sequence, seen.labelled, seen.config
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(2)
     if len(np.unique(static.track)) < config.geometric_depth.min_pose_points:
-        return StageRecord(kept, {"facts": [f"{said}; cameras are found with them all the same, as tracks are few"]})
+        return _kept(cameras, said, "tracks are few")
     try:
         found = structure_from_motion(
             replace(static, weight=np.ones(len(static)), depth=np.full(len(static), np.nan)),
@@ -184,10 +183,9 @@ def _structure_step(
     except Cancelled as error:
         raise Cancelled(STOPPED) from error
     except SolverError as error:
-        return StageRecord(kept, {"facts": [f"{said}; no cameras were found without them: {error}"]})
+        return _kept(cameras, said, f"none were found without them: {error}")
     if found is None or found.registered.mean() < _POSED:
-        why = "the camera hardly moves" if found is None else "many frames see too few points"
-        return StageRecord(kept, {"facts": [f"{said}; cameras are found with them all the same, as {why}"]})
+        return _kept(cameras, said, "the camera hardly moves" if found is None else "many frames see too few points")
     poses = se3.inverse(found.world_T_cam[0]) @ found.world_T_cam
     row = np.full(len(labelled.label), -1)
     row[found.track] = np.arange(len(found.track))
@@ -215,6 +213,13 @@ def _structure_step(
         "camera": found.camera.to_array(),
     }  # fmt: skip
     return StageRecord(arrays, summary)
+
+
+def _kept(cameras: Arrays, said: str, why: str) -> StageRecord:
+    """Return the cameras of stage 1, which rest on depths that are poor."""
+    warning = f"{said}, and cameras are found with them all the same, as {why}: path and focal lengths may be wrong"
+    record = {name: cameras[name] for name in ("world_T_cam", "intrinsics")}
+    return StageRecord(record, {"warnings": [f"{warning}; give better depth maps, or intrinsics that are right"]})
 
 
 def _scale(observations: Observations, world_T_cam: FloatArray, points: FloatArray) -> float:

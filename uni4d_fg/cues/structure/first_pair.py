@@ -8,7 +8,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
-from uni4d_fg.cues.structure.two_view import parallax
+from uni4d_fg.cues.structure.two_view import Parallax, parallax
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -18,7 +18,7 @@ class FramePair:
 
     first: int
     second: int
-    parallax_px: float
+    parallax: Parallax
     common: int
     """Number of tracks that both see."""
 
@@ -72,4 +72,4 @@ def rank_pairs(
 
 
 def _worth(pair: FramePair, config: GeometricDepthConfig) -> float:
-    return min(pair.parallax_px, config.start_parallax_px) * float(np.sqrt(min(pair.common, config.enough_tracks)))
+    return min(pair.parallax.median, config.start_parallax_px) * float(np.sqrt(min(pair.common, config.enough_tracks)))

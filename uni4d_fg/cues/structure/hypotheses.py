@@ -28,6 +28,9 @@ _MUCH = 0.25
 """From this part of the tracks on, those that disagree with the majority may be the world."""
 _OVERLAP = 0.5
 """Pairs that overlap by more than this part of their union are one start."""
+_BESIDE_A_WALL = 2.0
+"""A pair will do, too, if a quarter of the tracks has so many times the parallax that the median needs: the rest may be
+a wall."""
 
 
 Part = Literal["majority", "minority", "all"]
@@ -108,7 +111,10 @@ class Competition:
         if len(seen) == 0:
             return []
         ranked = rank_pairs(seen, self.num_frames, self.intrinsics, settings, known_focal=not self.free_focal)
-        return [pair for pair in ranked if pair.parallax_px >= settings.min_parallax_px]
+        least = settings.min_parallax_px
+        return [
+            pair for pair in ranked if pair.parallax.median >= least or pair.parallax.upper >= _BESIDE_A_WALL * least
+        ]
 
     def trial(self, pair: FramePair, factor: float, part: Part) -> Hypothesis | None:
         """Start from a pair, add frames around it, and judge; None if the pair gives no points."""

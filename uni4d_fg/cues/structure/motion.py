@@ -221,7 +221,7 @@ def only_turns(scene: GrowingScene, used: Observations) -> bool:
     """
     settings = scene.config.geometric_depth
     pairs = rank_pairs(used, len(scene.registered), scene.intrinsics, settings, known_focal=True)
-    return max((pair.parallax_px for pair in pairs), default=0.0) < settings.min_parallax_px
+    return max((pair.parallax.median for pair in pairs), default=0.0) < settings.min_parallax_px
 
 
 def rotations_only(observations: Observations, num_frames: int, intrinsics: FloatArray) -> FloatArray:

@@ -5,7 +5,8 @@ A camera that only turns moves every pixel by ``K R K^-1``, whatever the depth. 
     min over R and focal length f of  median_k | z'_k - pi_K(R pi_K^-1(z_k)) |      [px]
 
 and depth can be seen only where it is well above the noise of the tracks. The focal length is part of the
-minimum, because with a wrong one a pure rotation looks like parallax.
+minimum, because with a wrong one a pure rotation looks like parallax. Before a wall that fills most of the image the
+median says little, as moving along it looks like turning; then the quarter of the tracks that is left most tells.
 
 Sources: rotation by Kabsch (1976); essential matrix by Nister's five points with MAGSAC (OpenCV).
 """
@@ -13,6 +14,7 @@ Sources: rotation by Kabsch (1976); essential matrix by Nister's five points wit
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -61,12 +63,20 @@ def fit_rotation(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatA
         uv_second: (N, 2) px.
         intrinsics: (4,) px.
     """
-    rotation, left = _fit_rotations(uv_first, uv_second, intrinsics[None])
-    return RotationFit(rotation[0], float(left[0]))
+    rotation, distance = _fit_rotations(uv_first, uv_second, intrinsics[None])
+    return RotationFit(rotation[0], float(np.median(distance)))
 
 
-def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, *, known_focal: bool) -> float:
-    """Return the median motion (px) of N pixel pairs that no rotation explains.
+class Parallax(NamedTuple):
+    """Motion that no rotation explains, px."""
+
+    median: float
+    upper: float
+    """What a quarter of the tracks exceeds."""
+
+
+def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, *, known_focal: bool) -> Parallax:
+    """Return the motion of N pixel pairs that no rotation explains.
 
     Args:
         uv_first: (N, 2) px.
@@ -75,22 +85,24 @@ def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray
         known_focal: Whether the focal lengths are exact.
     """
     if known_focal:
-        return float(_left_by_rotations(uv_first, uv_second, intrinsics, np.ones(1))[0])
+        return _left_by_rotations(uv_first, uv_second, intrinsics, np.ones(1))[0]
     left = _left_by_rotations(uv_first, uv_second, intrinsics, _FOCAL_FACTORS)
-    if left.min() > _DOUBTFUL_PX:
-        return float(left.min())
+    least = min(left)
+    if least.median > _DOUBTFUL_PX:
+        return least
     # A camera that turns far leaves pixels at a focal length between two factors.
-    finer = _FOCAL_FACTORS[left.argmin()] * _FINER_FACTORS
-    return float(min(left.min(), _left_by_rotations(uv_first, uv_second, intrinsics, finer).min()))
+    finer = _FOCAL_FACTORS[left.index(least)] * _FINER_FACTORS
+    return min(least, *_left_by_rotations(uv_first, uv_second, intrinsics, finer))
 
 
 def _left_by_rotations(
     uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, factors: FloatArray
-) -> FloatArray:
-    """Return the median distance (F,) px that a rotation leaves at each of F multiples of the focal lengths."""
+) -> list[Parallax]:
+    """Return what a rotation leaves at each of F multiples of the focal lengths."""
     scale = np.ones((len(factors), 4))
     scale[:, :2] = factors[:, None]
-    return _fit_rotations(uv_first, uv_second, intrinsics * scale)[1]
+    _, distance = _fit_rotations(uv_first, uv_second, intrinsics * scale)
+    return [Parallax(*map(float, part)) for part in np.quantile(distance, [0.5, 0.75], axis=1).T]
 
 
 def _fit_rotations(
@@ -99,11 +111,11 @@ def _fit_rotations(
     """Fit a rotation to N pixel pairs (N, 2) for each of F intrinsics (F, 4), all at once.
 
     Returns:
-        Rotations (F, 3, 3) of the second camera seen from the first, and the median distance (F,) px that each leaves.
+        Rotations (F, 3, 3) of the second camera seen from the first, and the distances (F, N) px that each leaves.
     """
     a, b = _rays(uv_first, intrinsics), _rays(uv_second, intrinsics)
     weight = np.ones(a.shape[:2])
-    rotation, left = np.tile(np.eye(3), (len(a), 1, 1)), np.full(len(a), np.inf)
+    rotation, distance = np.tile(np.eye(3), (len(a), 1, 1)), np.full(a.shape[:2], np.inf)
     for _ in range(_REWEIGHTINGS):
         u, _, vt = np.linalg.svd((b * weight[..., None]).swapaxes(1, 2) @ a)
         u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
@@ -112,7 +124,7 @@ def _fit_rotations(
         distance = np.hypot(off[..., 0], off[..., 1])
         left = np.median(distance, axis=1)
         weight = 1.0 / np.maximum(distance / np.maximum(left, 1e-3)[:, None], 1.0)
-    return rotation, left
+    return rotation, distance
 
 
 def relative_pose(
