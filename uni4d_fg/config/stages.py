@@ -115,6 +115,13 @@ class BundleAdjustmentConfig(Section):
         gt=0,
         basic=True,
     )
+    first_depth_sigma: float | None = setting(
+        0.07,
+        "Standard deviation of the depth prior of the first solve, whose residuals tell the noise of the cue: cameras "
+        "that are held loosely depart from a sound cue, which would count as its noise, and hold them no closer "
+        "afterwards. null: that of depth_sigma and what widens it.",
+        gt=0,
+    )
     blurred_frames: float | None = setting(
         2.0,
         "Frames whose reprojection residuals are this many times those of the frames around them after the first solve "
@@ -141,7 +148,7 @@ class BundleAdjustmentConfig(Section):
         8.0, "Observations above this after the first solve are dropped, px.", gt=0, basic=True
     )
     trim_sigmas: float | None = setting(
-        None, "Landmarks of which most observations are farther off than so many times the noise of their frames are "
+        3.0, "Landmarks of which most observations are farther off than so many times the noise of their frames are "
         "dropped; null keeps them.", gt=0,
     )  # fmt: skip
     min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2, basic=True)

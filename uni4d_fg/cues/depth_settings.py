@@ -34,9 +34,8 @@ def settings_for_depth(config: Config, sequence: Sequence) -> Config:
 def settings_behind_lens(config: Config, sequence: Sequence, *, depth_is_needed: bool) -> Config:
     """Return the configuration of stages 1 to 3, once lens and zoom are known.
 
-    Cameras from motion are from the tracks that agree with most others: those that do not are left out here, too
-    (``bundle_adjustment.trim_sigmas``). Their intrinsics are kept, as a stage that takes all tracks for independent
-    would go to the focal length that their common errors ask for. And depth from motion is no cue for the cameras: what
+    Intrinsics of cameras from motion are kept, as a stage that takes all tracks for independent would go to the focal
+    length that their common errors ask for. And depth from motion is no cue for the cameras: what
     is interpolated between points that were found with them knows nothing that the tracks do not know, and is wrong
     behind every edge. Nor is it judged as a cue that was given, and a cue that the scale hangs on is not given up.
 
@@ -61,18 +60,8 @@ def settings_of_judgment(config: Config, sequence: Sequence, *, depth_is_needed:
 
 
 def settings_of_motion(config: Config) -> Config:
-    """Return the configuration of stage 2 for cameras that structure from motion found.
-
-    Their intrinsics are held, and tracks that depart from most others are left out.
-    """
-    stage = config.bundle_adjustment
-    trim = config.geometric_depth.stage_trim_sigmas if stage.trim_sigmas is None else stage.trim_sigmas
-    return config.model_copy(
-        update={
-            "input": config.input.model_copy(update={"intrinsics": "fixed"}),
-            "bundle_adjustment": stage.model_copy(update={"trim_sigmas": trim}),
-        }
-    )
+    """Return the configuration of stage 2 for cameras that structure from motion found: intrinsics are held."""
+    return config.model_copy(update={"input": config.input.model_copy(update={"intrinsics": "fixed"})})
 
 
 def without_depth_prior(config: Config) -> Config:

@@ -57,8 +57,13 @@ class FittedLens:
 
 
 def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
-    """Return the configuration of stages 1 and 2 for fits: cameras only, E_cam only between consecutive frames."""
-    stage = config.bundle_adjustment.model_copy(update={"structure": "keep", "covariance_cells": 0})
+    """Return the configuration of stages 1 and 2 for fits: cameras only, E_cam only between consecutive frames.
+
+    All tracks take part, and depth is held loosely from the start: where a cue contradicts the tracks, distortion would
+    seem to take away energy.
+    """
+    changes = {"structure": "keep", "covariance_cells": 0, "trim_sigmas": None, "first_depth_sigma": None}
+    stage = config.bundle_adjustment.model_copy(update=changes)
     return config.model_copy(update={"bundle_adjustment": stage if consecutive else without_camera_motion(stage)})
 
 

@@ -1,9 +1,10 @@
 """Stage 2: bundle adjustment of poses, intrinsics, depth scales and landmarks.
 
 Landmarks start at the mean lift of their depth cues. With the MAP energy a first solve uses the configured
-sigmas; observations that disagree are dropped, the noise of reprojection and of depth is measured on what
-stays, and a second solve uses it; in that one, tracks that are fragments of one point share a landmark. Frame 0's pose
-is the gauge; the depth prior (or, without it, the distance of the two farthest cameras) holds the scale.
+sigmas and believes the depth cue more closely; observations that disagree are dropped, the noise of reprojection and of
+depth is measured on what stays, and a second solve uses it; in that one, tracks that are fragments of one point share a
+landmark. Frame 0's pose is the gauge; the depth prior (or, without it, the distance of the two farthest cameras) holds
+the scale.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.config.stages import AccelerationConfig, BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch
@@ -45,6 +47,10 @@ from uni4d_fg.slam.stages.structure import (
     reprojection_term,
 )
 from uni4d_fg.slam.stages.terms import camera_motion_terms, intrinsics_priors
+
+_FIRST_DEPTH_KERNEL = KernelConfig(kind="cauchy", threshold=1.0)
+"""Of the first solve: a track beside an edge moves with what is in front and may have the depth behind, and among small
+things half of all do. A kernel that holds on to them bends the cameras."""
 
 
 @dataclass(frozen=True)
@@ -178,17 +184,17 @@ def adjust_bundle(
     rounds = 2 if energy.is_likelihood and config.measure_noise else 1
     motion = starting_prior(config.acceleration, timestamps, start.world_T_cam, landmarks)
 
-    def declare() -> Problem:
+    def declare(noise: StaticNoise, settings: BundleAdjustmentConfig) -> Problem:
         return bundle_adjustment_problem(
-            state, observations, noise, config, prior_intrinsics[None], freedom, energy, acceleration=motion
+            state, observations, noise, settings, prior_intrinsics[None], freedom, energy, acceleration=motion
         )
 
     for index in range(rounds):
-        problem = declare()
+        problem = declare(*(_of_first_solve(noise, config) if index < rounds - 1 else (noise, config)))
         return_free_memory(LARGE)
         if index == 1 and freedom.poses and motion.is_weak:
             motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
-            problem = declare()
+            problem = declare(noise, config)
         stage = Stage("bundle_adjustment", problem, config.solver)
         state, summary = run(stage, state, hooks)
         solves.append(summary)
@@ -239,6 +245,14 @@ def adjust_bundle(
         *covariances, solves, dropped, acceleration=motion if energy.is_likelihood else None,
     )  # fmt: skip
     return scene if merged is None else merged.split(scene)
+
+
+def _of_first_solve(noise: StaticNoise, config: BundleAdjustmentConfig) -> tuple[StaticNoise, BundleAdjustmentConfig]:
+    """Return the noise and the settings of the solve that the noise of the cue is measured after."""
+    if config.first_depth_sigma is None:
+        return noise, config
+    closely = replace(noise, depth_sigma=config.first_depth_sigma, depth_correlation=0.0)
+    return closely, config.model_copy(update={"depth_sigma_factor": 1.0, "depth_kernel": _FIRST_DEPTH_KERNEL})
 
 
 def hold_metric_scale(state: State) -> State:
