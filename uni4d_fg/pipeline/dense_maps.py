@@ -214,6 +214,8 @@ class DenseMaps:
         self.prefers_matching = 2 * sum(preferred) > len(preferred)
         if not (self.prefers_matching or self.broken):
             self.unmatched = _ADDS_NOTHING
+            if not self._cue_is_poor:
+                self.bleeding_px = 0.0  # told by depth that is the worse one
 
     def prepare(self, frames: list[int], mapped: OrderedMap) -> None:
         """Make what :meth:`final` needs for frames that follow each other, and forget what only those before needed.

@@ -169,9 +169,37 @@ def test_observations_behind_a_camera_are_dropped_and_counted(exact: LabelledTra
 def test_landmarks_that_contradict_the_depth_cue_are_dropped_and_counted(exact: LabelledTracks) -> None:
     depth = exact.depth.copy()
     depth[:10] *= 2.5
-    result = adjust(static_observations(dataclasses.replace(exact, depth=depth)), POSES)
-    assert result.dropped["landmark whose depth contradicts the cue"] == 10
-    assert result.landmark_track.min() == 10
+    seen = static_observations(dataclasses.replace(exact, depth=depth))
+    loosely = adjust(seen, POSES, changed(first_depth_sigma=None, trim_sigmas=None))
+    assert loosely.dropped["landmark whose depth contradicts the cue"] == 10
+    # Held closely, they stay at the depth of the cue, and are off in the images.
+    closely = adjust(seen, POSES)
+    assert closely.dropped["landmark that departs from the others"] == 10
+    for result in (loosely, closely):
+        assert result.landmark_track.min() == 10
+
+
+def test_a_sound_cue_is_believed_where_tracks_that_drift_tell_another_focal_length() -> None:
+    """A camera that goes past a scene and turns with it, and an exact cue.
+
+    Cameras of a loose start depart from the cue by what the tracks are off, which then counts as noise of the cue.
+    """
+    rng, part = np.random.default_rng(0), np.linspace(0.0, 1.0, FRAMES)
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, 0, 3] = 0.3 * part
+    poses[:, :3, :3] = se3.so3_exp(np.outer(part, [0.0, -0.1, 0.0]))
+    guess = K * np.array([1.1, 1.1, 1.0, 1.0])
+    error: dict[float | None, list[float]] = {0.07: [], None: []}
+    for _ in range(6):
+        drift = rng.normal(scale=1.0, size=(150, 1, 2)) * part[:, None]
+        off = drift + rng.normal(scale=0.2, size=(150, FRAMES, 2))
+        seen = static_observations(shift(observe(static_points(rng, 150), poses), off.astype(np.float32)))
+        for sigma, errors in error.items():
+            settings = changed(first_depth_sigma=sigma, focal_prior_fraction=0.5)
+            found = adjust(seen, poses, settings, intrinsics=guess, intrinsics_free=True)
+            errors.append(abs(float(np.log(found.cameras.intrinsics[0] / K[0]))))
+    assert np.mean(error[0.07]) < 0.03
+    assert np.mean(error[0.07]) < 0.7 * np.mean(error[None])
 
 
 def test_isolated_landmarks_are_dropped_and_counted(rng: np.random.Generator) -> None:
