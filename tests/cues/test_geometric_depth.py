@@ -209,6 +209,7 @@ def test_behind_the_lens_what_motion_told_is_no_cue_for_the_cameras() -> None:
     assert settings_behind_lens(config, given, depth_is_needed=False) == config
     stages = settings_behind_lens(config, seen, depth_is_needed=False)
     assert (stages.input.intrinsics, stages.bundle_adjustment.depth_prior) == ("fixed", False)
+    assert stages.bundle_adjustment.trim_sigmas == config.geometric_depth.stage_trim_sigmas
     needed = settings_behind_lens(config, seen, depth_is_needed=True)
     assert (needed.input.intrinsics, needed.bundle_adjustment.depth_prior) == ("fixed", True)
     asked = settings_behind_lens(

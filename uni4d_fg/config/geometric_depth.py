@@ -88,6 +88,9 @@ class GeometricDepthConfig(Section):
         2.5, "Cameras are refined from the tracks of which most observations agree within this many times the noise "
         "of all, at most max_reprojection_px.", gt=0,
     )  # fmt: skip
+    stage_trim_sigmas: float = setting(
+        3.0, "Takes the place of bundle_adjustment.trim_sigmas where the intrinsics are from camera motion.", gt=0
+    )
     min_trim_px: float = setting(0.3, "The least such limit, px.", gt=0)
     trim_rounds: int = setting(12, "How often the limit is lowered and cameras are refined, at most; 0 keeps it.", ge=0)
     epipolar_px: float = setting(

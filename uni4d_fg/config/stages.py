@@ -148,7 +148,7 @@ class BundleAdjustmentConfig(Section):
         8.0, "Observations above this after the first solve are dropped, px.", gt=0, basic=True
     )
     trim_sigmas: float | None = setting(
-        3.0, "Landmarks of which most observations are farther off than so many times the noise of their frames are "
+        4.0, "Landmarks of which most observations are farther off than so many times the noise of their frames are "
         "dropped; null keeps them.", gt=0,
     )  # fmt: skip
     min_observations: int = setting(3, "Landmarks seen in fewer frames are dropped.", ge=2, basic=True)

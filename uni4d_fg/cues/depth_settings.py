@@ -60,8 +60,17 @@ def settings_of_judgment(config: Config, sequence: Sequence, *, depth_is_needed:
 
 
 def settings_of_motion(config: Config) -> Config:
-    """Return the configuration of stage 2 for cameras that structure from motion found: intrinsics are held."""
-    return config.model_copy(update={"input": config.input.model_copy(update={"intrinsics": "fixed"})})
+    """Return the configuration of stage 2 for cameras that structure from motion found.
+
+    Their intrinsics are held, and fewer tracks may depart from most others than beside a depth cue.
+    """
+    trim = {"trim_sigmas": config.geometric_depth.stage_trim_sigmas}
+    return config.model_copy(
+        update={
+            "input": config.input.model_copy(update={"intrinsics": "fixed"}),
+            "bundle_adjustment": config.bundle_adjustment.model_copy(update=trim),
+        }
+    )
 
 
 def without_depth_prior(config: Config) -> Config:
