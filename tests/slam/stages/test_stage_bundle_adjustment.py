@@ -114,7 +114,8 @@ def test_points_with_the_depth_of_what_is_behind_them_do_not_set_the_scale(
     observations = static_observations(exact)
     observations.depth[:] *= np.exp(rng.normal(scale=0.005, size=len(observations)))
     observations.depth[observations.track < TRACKS // 8] *= 1.15
-    result = adjust(observations, start)
+    # A first solve that believes them bends this path by a hundredth: the images are exact, which no sigma allows for.
+    result = adjust(observations, start, changed(first_depth_sigma=None))
     length, true_length = (
         np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() for poses in (result.cameras.world_T_cam, POSES)
     )
