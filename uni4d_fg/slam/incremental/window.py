@@ -378,7 +378,8 @@ class CameraWindow:
         scale = frame_log_scales(observations, state[POSE], state[LANDMARK][rows][row], len(self))
         groups = {**state.arrays, LANDMARK: state[LANDMARK][rows], LOG_SCALE: scale[:, None]}
         local = State(groups, {LANDMARK: rows})
-        rule = config.model_copy(update={"min_observations": incremental.min_observations})
+        # Few keyframes say too little of which tracks depart from the others.
+        rule = config.model_copy(update={"min_observations": incremental.min_observations, "trim_sigmas": None})
         kept_state, kept = drop_outliers(local, observations, rule, {})
         code = self.observations.track * (len(self) + 1) + self.observations.frame
         used = self.landmark_track[observations.track] * (len(self) + 1) + observations.frame
