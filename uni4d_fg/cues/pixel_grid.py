@@ -9,9 +9,9 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.cues.static_scene import StaticPrediction, predict_static_at
 from uni4d_fg.cues.track_motion import SharedError
-from uni4d_fg.factors.zoom import zoomed_intrinsics
 from uni4d_fg.frontend.sequence.resize import scale_intrinsics
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.reconstruction import zoomed
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,4 @@ class PixelGrid:
 
     def _intrinsics(self, frame: int) -> FloatArray:
         intrinsics, zoom = self.camera.intrinsics, self.camera.zoom
-        return (
-            intrinsics if zoom is None else np.asarray(zoomed_intrinsics(intrinsics, np.log(zoom[frame : frame + 1])))
-        )
+        return intrinsics if zoom is None else zoomed(intrinsics, zoom, len(zoom))[frame]

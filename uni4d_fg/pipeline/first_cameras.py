@@ -29,7 +29,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.fingerprint import stage_key
 from uni4d_fg.pipeline.in_progress import RunInProgress
-from uni4d_fg.pipeline.lens import as_pinhole
+from uni4d_fg.pipeline.lens import as_pinhole, found_camera
 from uni4d_fg.pipeline.steps import STOPPED, Arrays, camera_init_step
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.warnings import focal_warnings
@@ -232,7 +232,7 @@ def _scale(observations: Observations, world_T_cam: FloatArray, points: FloatArr
 
 def _found_camera(found: Arrays, sequence: Sequence) -> CameraModel:
     """Return the lens and the zoom of the record of :func:`_structure_step`."""
-    camera = CameraModel.of_array(found["camera"], found["intrinsics"])
+    camera = found_camera(found)
     if camera.is_plain:
         return CameraModel(sequence.intrinsics)
     return replace(camera, focal_sigma=float(found["focal_sigma"]))

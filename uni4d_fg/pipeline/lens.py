@@ -152,5 +152,5 @@ def lens_step(
 
 
 def found_camera(record: Mapping[str, npt.NDArray[Any]]) -> CameraModel:
-    """Return the camera of a record of :func:`lens_step`."""
+    """Return the camera of a record of :func:`lens_step`, or of structure from motion."""
     return CameraModel.of_array(record["camera"], record["intrinsics"])

@@ -21,7 +21,6 @@ from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.problems import RealPixels, lens_family, lens_problem
-from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
@@ -54,6 +53,11 @@ class FittedLens:
     def intrinsics(self) -> FloatArray:
         """(4,) px."""
         return self.scene.cameras.intrinsics
+
+    @property
+    def camera(self) -> CameraModel:
+        """Intrinsics, lens and zoom."""
+        return CameraModel(self.intrinsics, self.lens, None if self.zoom is None else np.exp(self.zoom))
 
 
 def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
@@ -235,8 +239,7 @@ class HeldOut:
     def energies(self, fit: FittedLens) -> FloatArray:
         """Triangulate the tracks under frozen cameras; return each one's robust energy per observation, NaN if lost."""
         cameras, ba = fit.scene.cameras, self.config.bundle_adjustment
-        zoom = None if fit.zoom is None else np.exp(fit.zoom)
-        ideal = CameraModel(cameras.intrinsics, fit.lens, zoom).ideal_labelled(self.tracks)
+        ideal = fit.camera.ideal_labelled(self.tracks)
         seen = observations_of(ideal, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(3)
         tracks, row = seen.rows()
         landmarks = mean_per_row(lift(seen, cameras), seen.weight, row, len(tracks))
@@ -260,7 +263,5 @@ def _errors(
 ) -> FloatArray:
     """Return the distance, px, of real pixels of observations (N,) from where points (N, 3) appear."""
     x = world_to_camera(fit.scene.cameras.world_T_cam[frame], points)
-    factor = None if fit.zoom is None else np.exp(fit.zoom)
-    seen = project(zoomed(fit.intrinsics, factor, len(fit.scene.cameras.world_T_cam))[frame], x)
-    real = fit.lens.real_pixels(fit.intrinsics, np.asarray(seen))
+    real = fit.camera.real(np.asarray(project(fit.intrinsics, x)), frame)
     return np.asarray(np.linalg.norm(real - tracks.tracks.uv[track, frame], axis=1))
