@@ -87,6 +87,19 @@ def test_an_interrupted_stream_goes_on_where_it_was(tmp_path: Path, undisturbed:
     assert_same(tmp_path, undisturbed)
 
 
+@pytest.mark.parametrize("refine", ["on", "off"])
+def test_an_interrupted_stream_goes_on_with_the_points_that_it_followed(tmp_path: Path, refine: str) -> None:
+    """The velocities tell where points are looked for, the first views where they are found."""
+    config = CONFIG.model_copy(update={"tracking": CONFIG.tracking.model_copy(update={"refine": refine})})
+    sequence = replace(stream_of(14, render_images=True, objects="none"), tracks=None)
+    stream_sequence(sequence, tmp_path / "undisturbed", config)
+    polls = iter(range(14))
+    with pytest.raises(Cancelled):
+        stream_sequence(sequence, tmp_path / "run", config, should_stop=lambda: next(polls) == 9)
+    stream_sequence(sequence, tmp_path / "run", config, resume=True)
+    assert_same(tmp_path / "run", tmp_path / "undisturbed")
+
+
 def test_a_killed_stream_goes_on_from_its_last_checkpoint(
     tmp_path: Path, undisturbed: Path, rng: np.random.Generator
 ) -> None:

@@ -65,7 +65,11 @@ class CameraConfig(Section):
         0.02, "Part of the longer image side below which that distance needs a gain on held-out tracks too.", ge=0, le=1
     )
     min_evidence_unsure: float = setting(
-        0.01, "Part of the reprojection energy that a lens below that distance must take away.", ge=0, lt=1
+        0.01,
+        "Part of the reprojection energy that a lens below that distance must take away; one beyond it that takes away "
+        "less needs a gain on held-out tracks, too.",
+        ge=0,
+        lt=1,
     )
     max_held_out_loss: float = setting(
         0.1, "Part by which it may explain held-out tracks worse, however far it moves pixels.", ge=0

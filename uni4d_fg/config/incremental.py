@@ -55,7 +55,7 @@ class IncrementalConfig(Section):
         0.02, "Standard deviation of a bridged frame's position about constant velocity, m per frame bridged.", gt=0
     )
     free_intrinsics_from: int = setting(
-        5, "The focal lengths are held until the window has this many keyframes (if input.intrinsics is free).", ge=2
+        3, "The focal lengths are held until the window has this many keyframes (if input.intrinsics is free).", ge=2
     )
     focal_sigma: float = setting(
         0.002,

@@ -31,6 +31,8 @@ _WINDOW = (
 )  # fmt: skip
 _OBSERVATIONS = ("track", "frame", "uv", "depth", "weight")
 _BOOK = ("track", "first_frame", "last_frame", "label", "votes", "disagreeing", "color")
+_TRACKER = ("track", "points", "velocity")
+_FIRST_VIEWS = ("templates", "affine", "due")
 _DYNAMIC_POINTS = ("track", "instance", "point", "observed", "color")
 _LANDMARKS = ("track", "point", "error", "count", "color", "keyframe")
 
@@ -61,7 +63,9 @@ def state_arrays(solver: IncrementalReconstructor) -> Arrays:
     out |= {f"dynamic_observed_{name}": getattr(dynamic.observations, name) for name in _OBSERVATIONS}
     out["dynamic_depth_sigma"] = np.array(dynamic.depth_sigma)
     out |= {f"book_{name}": getattr(solver.book, name) for name in _BOOK}
-    out |= {"tracker_track": tracker.track, "tracker_points": tracker.points}
+    out |= {f"tracker_{name}": getattr(tracker, name) for name in _TRACKER}
+    if tracker.views is not None:
+        out |= {f"first_views_{name}": array for name, array in tracker.views.to_arrays().items()}
     out["tracker_counters"] = np.array([tracker.next_track, tracker.since_query])
     if tracker.previous is not None:
         out["tracker_previous"] = tracker.previous
@@ -121,7 +125,10 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
     dynamic.depth_sigma = float(arrays["dynamic_depth_sigma"])
     for name in _BOOK:
         setattr(solver.book, name, arrays[f"book_{name}"])
-    tracker.track, tracker.points = arrays["tracker_track"], arrays["tracker_points"]
+    for name in _TRACKER:
+        setattr(tracker, name, arrays[f"tracker_{name}"])
+    if tracker.views is not None:
+        tracker.views.restore(*(arrays[f"first_views_{name}"] for name in _FIRST_VIEWS))
     tracker.next_track, tracker.since_query = (int(n) for n in arrays["tracker_counters"].tolist())
     tracker.previous = arrays.get("tracker_previous")
     points = _points_list("pending", arrays)

@@ -11,6 +11,7 @@ from uni4d_fg.config.cues import TrackingConfig
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
 from uni4d_fg.frontend.tracks.registration import cut_templates, is_fast, register
+from uni4d_fg.slam.incremental.tracking import OnlineTracker
 
 HEIGHT, WIDTH = 120, 160
 CENTER = np.array([80.0, 60.0])
@@ -98,20 +99,44 @@ def test_templates_are_cut_between_pixels_and_empty_outside() -> None:
     assert np.isnan(template[2]).all()
 
 
-def test_errors_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slow turn, zoom and shift over 40 frames with noise: steps drift, points that are found again do not."""
-    frames, images = 41, []
-    noise = np.random.default_rng(3)
+FRAMES = 41
 
-    def motion(t: int) -> tuple[FloatArray, FloatArray]:
-        angle, scale = 0.008 * t, 1.004**t
-        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return scale * rotation, np.array([0.11 * t, -0.07 * t])
 
-    for t in range(frames):
+def motion(t: int) -> tuple[FloatArray, FloatArray]:
+    """A slow turn, zoom and shift."""
+    angle, scale = 0.008 * t, 1.004**t
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return scale * rotation, np.array([0.11 * t, -0.07 * t])
+
+
+def noisy_images() -> ImageArray:
+    """The texture under that motion, with noise."""
+    images, noise = [], np.random.default_rng(3)
+    for t in range(FRAMES):
         stretch, shift = motion(t)
         exact = textured(np.linalg.inv(stretch), shift).astype(float)
         images.append(np.clip(exact + noise.normal(0, 3, exact.shape), 0, 255).astype(np.uint8))
+    return np.stack(images)
+
+
+def drift_of(first: Float32Array | FloatArray, last: Float32Array | FloatArray) -> float:
+    """Median distance of points (N, 2) px in the last image from where those of the first one went."""
+    stretch, shift = motion(FRAMES - 1)
+    truth = (first - CENTER - shift) @ stretch.T + CENTER
+    return float(np.median(np.linalg.norm(last - truth, axis=1)))
+
+
+def following(every: int) -> TrackingConfig:
+    """Points whose first views are looked for every so many steps; 0: steps alone."""
+    return TrackingConfig(
+        grid_columns=12, grid_rows=9, query_interval=100, margin_px=30, reseed_spacing=None,
+        refine="on" if every else "off", refine_every=max(every, 1),
+    )  # fmt: skip
+
+
+def test_errors_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over 40 frames with noise steps drift, points that are found again do not."""
+    images = noisy_images()
     looked_for: list[int] = []
 
     def counted(templates: Float32Array, rows: IntArray, *rest: Any) -> tuple[FloatArray, FloatArray]:
@@ -123,21 +148,10 @@ def test_errors_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     number: dict[int, int] = {}
     for every in (1, 4, 0):
         looked_for.clear()
-        config = TrackingConfig(
-            grid_columns=12,
-            grid_rows=9,
-            query_interval=100,
-            margin_px=30,
-            reseed_spacing=None,
-            refine="on" if every else "off",
-            refine_every=max(every, 1),
-        )
-        tracks = track_grid(ArrayFrames(np.stack(images)), config)
-        stretch, shift = motion(40)
-        truth = (tracks.uv[:, 0] - CENTER - shift) @ stretch.T + CENTER
-        seen = tracks.visible[:, 40]
+        tracks = track_grid(ArrayFrames(images), following(every))
+        seen = tracks.visible[:, -1]
         assert seen.mean() > 0.9
-        drift[every] = float(np.median(np.linalg.norm(tracks.uv[:, 40] - truth, axis=1)[seen]))
+        drift[every] = drift_of(tracks.uv[seen, 0], tracks.uv[seen, -1])
         number[every] = sum(looked_for)
     assert drift[1] < 0.08
     assert drift[1] < 0.5 * drift[0]
@@ -145,3 +159,16 @@ def test_errors_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert drift[4] < 0.6 * drift[0]
     assert number[0] == 0
     assert 0.23 < number[4] / number[1] < 0.3
+
+
+def test_errors_do_not_add_up_in_a_stream() -> None:
+    drift = {}
+    for every in (1, 4, 0):
+        tracker = OnlineTracker(following(every), max_tracks=200)
+        first, *_, last = [tracker.advance(image) for image in noisy_images()]
+        assert len(last.track) > 0.9 * len(first.track)
+        drift[every] = drift_of(first.uv[np.isin(first.track, last.track)], last.uv)
+    assert drift[1] < 0.08
+    assert drift[1] < 0.5 * drift[0]
+    assert drift[4] < 0.1
+    assert drift[4] < 0.6 * drift[0]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from stream_samples import ate, feed, path_length, stream, stream_config, true_poses
+from stream_samples import SMALL, ate, feed, path_length, stream, stream_config, true_poses
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.errors import ConfigError, DegenerateProblemError, InputError
@@ -120,6 +121,18 @@ def test_intrinsics_are_fixed_once_they_are_known() -> None:
     assert not solver.window.intrinsics_free
     fixed, _ = feed(stream(FRAMES), stream_config("input.intrinsics=fixed"), frames=list(range(16)))
     np.testing.assert_array_equal(fixed.intrinsics, stream(FRAMES).intrinsics)
+
+
+def test_a_wrong_focal_length_does_not_count_as_noise_of_the_cue() -> None:
+    """Cameras of a focal length 21 % too long depart from the cue, which would then hardly be believed."""
+    sequence = stream(40)
+    given = replace(sequence, intrinsics=sequence.intrinsics * [1.15, 1.15, 1.0, 1.0])
+    config = stream_config("incremental.window=8", "incremental.keyframe_parallax=0.006")
+    solver, _ = feed(given, config)
+    assert abs(solver.intrinsics[0] / SMALL["focal"] - 1.0) < 0.025
+    # A smooth error of 2 % and one of 1 % per pixel.
+    assert solver.window.noise.depth_sigma == pytest.approx(np.hypot(0.02, 0.01), rel=0.2)
+    assert ate(solver.finish().world_T_cam, true_poses(sequence)) < 0.013
 
 
 def test_tracks_are_made_online() -> None:

@@ -184,6 +184,7 @@ def test_a_small_distortion_needs_held_out_tracks() -> None:
         (0.02, 3.0, 0.01, True),
         (0.0061, 2.8, 0.02, False),  # of a pinhole, where masks and the depth cue are bad
         (0.0061, 30.0, 0.02, True),
+        (0.0061, 30.0, -0.02, False),  # of a pinhole: a dim room, and a desk without texture
         (0.02, np.inf, 0.05, False),
     ],
 )

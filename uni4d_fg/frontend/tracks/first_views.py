@@ -9,8 +9,10 @@ view where the step led it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.cues import TrackingConfig
@@ -63,6 +65,15 @@ class FirstViews:
         # Spread over the steps, so that no frame has all the corrections.
         self.due = np.concatenate((self.due, np.arange(len(points)) % self.config.refine_every))
         self._used = end
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return what is known of the points, to go on from with :meth:`restore`."""
+        return {"templates": self.templates[self.row], "affine": self.affine, "due": self.due}
+
+    def restore(self, templates: Float32Array, affine: FloatArray, due: IntArray) -> None:
+        """Take over what :meth:`to_arrays` returned."""
+        self.templates, self.row, self._used = templates, np.arange(len(templates)), len(templates)
+        self.affine, self.due = affine, due
 
     def select(self, keep: BoolArray | IntArray) -> None:
         """Forget all points but those picked by a mask or by indices."""

@@ -36,7 +36,7 @@ from uni4d_fg.optim.marginalization import marginalize_with_spread
 from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.slam.incremental.labels import LabelledFrame
 from uni4d_fg.slam.incremental.point_errors import PointErrors, point_errors
-from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, held_to_the_cue
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.lifting import frame_log_scales, lift, mean_per_row
 from uni4d_fg.slam.stages.observations import Observations
@@ -329,10 +329,12 @@ class CameraWindow:
         chosen = replace(self.observations.select(mine), track=at[mine])
         chosen = chosen.select(np.lexsort([chosen.frame, chosen.track]))
         state = self._cameras().state(self.landmark, self.landmark_track, self.frame)
-        ba = self.config.bundle_adjustment
+        noise, ba = self.noise, self.config.bundle_adjustment
+        if not self.slides:  # the noise of the cue is measured on the first window, as after the batch's first solve
+            noise, ba = held_to_the_cue(noise, ba)
         free_intrinsics = self._free_intrinsics() if free_intrinsics is None else free_intrinsics
         problem = bundle_adjustment_problem(
-            state, chosen, self.noise, ba, self.prior_intrinsics[None],
+            state, chosen, noise, ba, self.prior_intrinsics[None],
             Freedom(poses=True, intrinsics=free_intrinsics), camera_motion=self._motion_terms(),
         ).add(self._bridge_terms())  # fmt: skip
         if self.slides:  # the prior holds the gauge

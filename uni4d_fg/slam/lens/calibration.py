@@ -212,10 +212,11 @@ def is_taken(
         return False
     if is_far(candidate.lens, settings):
         return False
-    unsure = candidate.displacement_px < settings.sure_displacement * max(image_size)
-    if unsure and not after_another and candidate.evidence < settings.min_evidence_unsure:
+    small = candidate.displacement_px < settings.sure_displacement * max(image_size)
+    little = candidate.evidence < settings.min_evidence_unsure
+    if small and little and not after_another:
         return False
-    if after_another or unsure:
+    if after_another or small or little:
         return candidate.held_out_gain > 0.0
     return candidate.held_out_gain >= -settings.max_held_out_loss
 

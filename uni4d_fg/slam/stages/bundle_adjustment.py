@@ -190,7 +190,7 @@ def adjust_bundle(
         )
 
     for index in range(rounds):
-        problem = declare(*(_of_first_solve(noise, config) if index < rounds - 1 else (noise, config)))
+        problem = declare(*(held_to_the_cue(noise, config) if index < rounds - 1 else (noise, config)))
         return_free_memory(LARGE)
         if index == 1 and freedom.poses and motion.is_weak:
             motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
@@ -247,8 +247,8 @@ def adjust_bundle(
     return scene if merged is None else merged.split(scene)
 
 
-def _of_first_solve(noise: StaticNoise, config: BundleAdjustmentConfig) -> tuple[StaticNoise, BundleAdjustmentConfig]:
-    """Return the noise and the settings of the solve that the noise of the cue is measured after."""
+def held_to_the_cue(noise: StaticNoise, config: BundleAdjustmentConfig) -> tuple[StaticNoise, BundleAdjustmentConfig]:
+    """Return the noise and the settings of solves that the noise of the cue is measured after."""
     if config.first_depth_sigma is None:
         return noise, config
     closely = replace(noise, depth_sigma=config.first_depth_sigma, depth_correlation=0.0)
