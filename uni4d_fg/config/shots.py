@@ -45,6 +45,13 @@ class ShotsConfig(Section):
         gt=0,
         le=1,
     )
+    min_explained: float = setting(
+        0.4,
+        "Part of the variance of its frames that a dissolve explains as a blend of both sides, over the shortest span; "
+        "over longer ones less, in the same proportion.",
+        ge=0,
+        le=1,
+    )
     min_blend_gain: float = setting(
         0.14,
         "Part of the variance of a frame of a dissolve that both shots explain beyond what one does, at least.",

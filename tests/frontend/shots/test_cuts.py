@@ -15,6 +15,7 @@ from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.shots.cuts import Cut, _Search, find_cuts
 from uni4d_fg.frontend.shots.links import small_frame
+from uni4d_fg.frontend.shots.survival import Span
 
 CONFIG = ShotsConfig()
 HEIGHT, WIDTH = 120, 160
@@ -126,6 +127,19 @@ def test_corners_outlive_what_is_no_dissolve() -> None:
     found = cuts(clip)
     assert len(found) == 1
     assert abs(found[0].frame - cut.frame) <= 2
+
+
+@pytest.mark.parametrize(("more", "is_one"), [(0.0, False), (0.2, True)])
+def test_what_no_blend_explains_is_no_dissolve(monkeypatch: pytest.MonkeyPatch, more: float, is_one: bool) -> None:
+    """As measured on a fast orbit: one side goes as the other comes, among much that neither of them shows."""
+    shares = np.array([0.0, 0.11, 0.17, 0.28, 0.38, 0.56, 0.71, 0.86, 0.98])
+    explained = np.array([0.77, 0.49, 0.32, 0.31, 0.34, 0.3, 0.37, 0.48, 0.77]) + more
+    gained = np.array([0.0, 0.005, 0.011, 0.034, 0.084, 0.161, 0.074, 0.018, 0.0])
+    search = _Search([small_frame(frame, CONFIG) for frame in shot(0, 11)], CONFIG)
+    monkeypatch.setattr(search, "connected", lambda a, b: (False, np.eye(2, 3)))
+    monkeypatch.setattr(search, "blend", lambda a, b: (shares, explained, gained))
+    found = search.dissolve(Span(0, 10, 0.0))
+    assert found is None if not is_one else found is not None and found.cut == Cut(3, 9)
 
 
 def test_a_cut_that_larger_images_do_not_show_is_none(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -271,6 +271,9 @@ class _Search:
         is_whole = bool(shares[1] < 0.1 and shares[-2] > 0.9 and stop > a + 1 and start < b)
         off_center = abs(stop + start - a - b) / (b - a)
         quality = float(explained[mixed].mean())
+        # What moves between frames is followed by one affine motion, the less well the longer the span is.
+        if quality < self.config.min_explained * min(self.config.dissolve_spans) / (b - a):
+            return None
         return _Dissolve(Cut(stop, start), is_whole, quality, ((start - stop) * (1.0 if is_whole else 1.5), off_center))
 
     def accumulated(self, a: int, b: int) -> FloatArray:
