@@ -198,3 +198,25 @@ def test_a_restored_state_is_the_stored_one_in_every_array() -> None:
     del stored["window_noise"]
     with pytest.raises(InputError, match="damaged"):
         restore(again, stored)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_points_are_followed_on_as_they_were(monkeypatch: pytest.MonkeyPatch, fast: bool) -> None:
+    """With and without the C++ extension points are followed in two ways; a stream keeps to its own."""
+    sequence = stream_of(4, render_images=True, objects="none")
+
+    def solver(is_fast: bool) -> IncrementalReconstructor:
+        monkeypatch.setattr("uni4d_fg.frontend.tracks.first_views.is_fast", lambda: is_fast)
+        return IncrementalReconstructor(sequence.intrinsics, sequence.image_size, CONFIG)
+
+    first = solver(fast)
+    for t in range(3):
+        first.add_frame(sequence.images[t], sequence.depths[t], sequence.masks[t])
+    assert (first.tracker.views is not None) is fast
+    again = solver(not fast)
+    restore(again, state_arrays(first))
+    assert (again.tracker.views is not None) is fast
+    for one in (first, again):
+        one.add_frame(sequence.images[3], sequence.depths[3], sequence.masks[3])
+    np.testing.assert_array_equal(again.tracker.points, first.tracker.points)
+    np.testing.assert_array_equal(again.window.pose, first.window.pose)

@@ -16,6 +16,7 @@ from uni4d_fg.errors import InputError
 from uni4d_fg.factors.batch import FactorBatch, Slot
 from uni4d_fg.factors.marginalization_prior import marginalization_prior_type
 from uni4d_fg.factors.variable import variable_type
+from uni4d_fg.frontend.tracks.first_views import FirstViews
 from uni4d_fg.optim.cluster_robust import Spread
 from uni4d_fg.slam.incremental.model import DynamicPoints, FinishedFrame, FrameStatus, Landmarks
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor, PendingFrame
@@ -127,7 +128,10 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
         setattr(solver.book, name, arrays[f"book_{name}"])
     for name in _TRACKER:
         setattr(tracker, name, arrays[f"tracker_{name}"])
-    if tracker.views is not None:
+    # As the stream began, whether or not the C++ extension is here too.
+    tracker.views = None
+    if f"first_views_{_FIRST_VIEWS[0]}" in arrays:
+        tracker.views = FirstViews(tracker.config)
         tracker.views.restore(*(arrays[f"first_views_{name}"] for name in _FIRST_VIEWS))
     tracker.next_track, tracker.since_query = (int(n) for n in arrays["tracker_counters"].tolist())
     tracker.previous = arrays.get("tracker_previous")

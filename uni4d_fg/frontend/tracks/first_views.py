@@ -67,13 +67,13 @@ class FirstViews:
         self._used = end
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what is known of the points, to go on from with :meth:`restore`."""
-        return {"templates": self.templates[self.row], "affine": self.affine, "due": self.due}
+        """Return a copy of what is known of the points, to go on from with :meth:`restore`."""
+        return {"templates": self.templates[self.row], "affine": self.affine.copy(), "due": self.due.copy()}
 
     def restore(self, templates: Float32Array, affine: FloatArray, due: IntArray) -> None:
-        """Take over what :meth:`to_arrays` returned."""
-        self.templates, self.row, self._used = templates, np.arange(len(templates)), len(templates)
-        self.affine, self.due = affine, due
+        """Go on from a copy of what :meth:`to_arrays` returned."""
+        self.templates, self.row, self._used = templates.copy(), np.arange(len(templates)), len(templates)
+        self.affine, self.due = affine.copy(), due.copy()
 
     def select(self, keep: BoolArray | IntArray) -> None:
         """Forget all points but those picked by a mask or by indices."""
