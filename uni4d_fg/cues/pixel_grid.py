@@ -68,4 +68,4 @@ class PixelGrid:
 
     def _intrinsics(self, frame: int) -> FloatArray:
         intrinsics, zoom = self.camera.intrinsics, self.camera.zoom
-        return intrinsics if zoom is None else zoomed(intrinsics, zoom, len(zoom))[frame]
+        return intrinsics if zoom is None else zoomed(intrinsics, zoom[frame : frame + 1], 1)[0]

@@ -33,7 +33,7 @@ _WINDOW = (
 _OBSERVATIONS = ("track", "frame", "uv", "depth", "weight")
 _BOOK = ("track", "first_frame", "last_frame", "label", "votes", "disagreeing", "color")
 _TRACKER = ("track", "points", "velocity")
-_FIRST_VIEWS = ("templates", "affine", "due")
+_FIRST_VIEWS = "first_views_"
 _DYNAMIC_POINTS = ("track", "instance", "point", "observed", "color")
 _LANDMARKS = ("track", "point", "error", "count", "color", "keyframe")
 
@@ -66,7 +66,7 @@ def state_arrays(solver: IncrementalReconstructor) -> Arrays:
     out |= {f"book_{name}": getattr(solver.book, name) for name in _BOOK}
     out |= {f"tracker_{name}": getattr(tracker, name) for name in _TRACKER}
     if tracker.views is not None:
-        out |= {f"first_views_{name}": array for name, array in tracker.views.to_arrays().items()}
+        out |= {f"{_FIRST_VIEWS}{name}": array for name, array in tracker.views.to_arrays().items()}
     out["tracker_counters"] = np.array([tracker.next_track, tracker.since_query])
     if tracker.previous is not None:
         out["tracker_previous"] = tracker.previous
@@ -129,10 +129,8 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
     for name in _TRACKER:
         setattr(tracker, name, arrays[f"tracker_{name}"])
     # As the stream began, whether or not the C++ extension is here too.
-    tracker.views = None
-    if f"first_views_{_FIRST_VIEWS[0]}" in arrays:
-        tracker.views = FirstViews(tracker.config)
-        tracker.views.restore(*(arrays[f"first_views_{name}"] for name in _FIRST_VIEWS))
+    views = {n.removeprefix(_FIRST_VIEWS): array for n, array in arrays.items() if n.startswith(_FIRST_VIEWS)}
+    tracker.views = FirstViews.of_arrays(tracker.config, views) if views else None
     tracker.next_track, tracker.since_query = (int(n) for n in arrays["tracker_counters"].tolist())
     tracker.previous = arrays.get("tracker_previous")
     points = _points_list("pending", arrays)

@@ -139,7 +139,7 @@ def test_what_no_blend_explains_is_no_dissolve(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(search, "connected", lambda a, b: (False, np.eye(2, 3)))
     monkeypatch.setattr(search, "blend", lambda a, b: (shares, explained, gained))
     found = search.dissolve(Span(0, 10, 0.0))
-    assert found is None if not is_one else found is not None and found.cut == Cut(3, 9)
+    assert (None if found is None else found.cut) == (Cut(3, 9) if is_one else None)
 
 
 def test_a_cut_that_larger_images_do_not_show_is_none(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from uni4d_fg.slam.incremental.tracking import OnlineTracker
 
 HEIGHT, WIDTH = 120, 160
 CENTER = np.array([80.0, 60.0])
+FRAMES = 41
 IDENTITY = np.array([1.0, 0.0, 0.0, 1.0])
 
 
@@ -99,9 +100,6 @@ def test_templates_are_cut_between_pixels_and_empty_outside() -> None:
     assert np.isnan(template[2]).all()
 
 
-FRAMES = 41
-
-
 def motion(t: int) -> tuple[FloatArray, FloatArray]:
     """A slow turn, zoom and shift."""
     angle, scale = 0.008 * t, 1.004**t
@@ -162,10 +160,10 @@ def test_errors_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_errors_do_not_add_up_in_a_stream() -> None:
-    drift = {}
+    images, drift = noisy_images(), {}
     for every in (1, 4, 0):
         tracker = OnlineTracker(following(every), max_tracks=200)
-        first, *_, last = [tracker.advance(image) for image in noisy_images()]
+        first, *_, last = [tracker.advance(image) for image in images]
         assert len(last.track) > 0.9 * len(first.track)
         drift[every] = drift_of(first.uv[np.isin(first.track, last.track)], last.uv)
     assert drift[1] < 0.08

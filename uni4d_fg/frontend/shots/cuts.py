@@ -195,7 +195,11 @@ class _Search:
 
         The longer the span, the fewer corners outlive it in a video without any cut.
         """
-        return self.config.max_surviving * min(self.config.dissolve_spans) / (span.last - span.first)
+        return self.over(self.config.max_surviving, span)
+
+    def over(self, limit: float, span: Span) -> float:
+        """Return a limit that holds over the shortest span for another one, in proportion to how much longer it is."""
+        return limit * min(self.config.dissolve_spans) / (span.last - span.first)
 
     def dissolves(self) -> list[Cut]:
         found: list[_Dissolve] = []
@@ -272,7 +276,7 @@ class _Search:
         off_center = abs(stop + start - a - b) / (b - a)
         quality = float(explained[mixed].mean())
         # What moves between frames is followed by one affine motion, the less well the longer the span is.
-        if quality < self.config.min_explained * min(self.config.dissolve_spans) / (b - a):
+        if quality < self.over(self.config.min_explained, span):
             return None
         return _Dissolve(Cut(stop, start), is_whole, quality, ((start - stop) * (1.0 if is_whole else 1.5), off_center))
 

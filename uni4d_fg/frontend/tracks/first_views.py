@@ -8,6 +8,7 @@ view where the step led it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.cues import TrackingConfig
-from uni4d_fg.frontend.tracks.guided_search import search
+from uni4d_fg.frontend.tracks.guided_search import move_points, search
 from uni4d_fg.frontend.tracks.optical_flow import comes_back
 from uni4d_fg.frontend.tracks.registration import cut_templates, is_fast, register
 
@@ -67,13 +68,16 @@ class FirstViews:
         self._used = end
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return a copy of what is known of the points, to go on from with :meth:`restore`."""
+        """Return a copy of what is known of the points, to go on from with :meth:`of_arrays`."""
         return {"templates": self.templates[self.row], "affine": self.affine.copy(), "due": self.due.copy()}
 
-    def restore(self, templates: Float32Array, affine: FloatArray, due: IntArray) -> None:
+    @classmethod
+    def of_arrays(cls, config: TrackingConfig, arrays: Mapping[str, npt.NDArray[Any]]) -> FirstViews:
         """Go on from a copy of what :meth:`to_arrays` returned."""
-        self.templates, self.row, self._used = templates.copy(), np.arange(len(templates)), len(templates)
-        self.affine, self.due = affine.copy(), due.copy()
+        views = cls(config, affine=arrays["affine"].copy(), due=arrays["due"].copy())
+        views.templates, views._used = arrays["templates"].copy(), len(arrays["templates"])
+        views.row = np.arange(views._used)
+        return views
 
     def select(self, keep: BoolArray | IntArray) -> None:
         """Forget all points but those picked by a mask or by indices."""
@@ -120,6 +124,23 @@ class FirstViews:
         self.due -= 1
         self.select(kept)
         return kept, refined[kept]
+
+
+def follow_points(
+    views: FirstViews | None,
+    source: ImageArray,
+    target: ImageArray,
+    points: Float32Array,
+    velocity: Float32Array,
+    config: TrackingConfig,
+) -> tuple[BoolArray, Float32Array]:
+    """Move points from one gray image to the next by their first views, by steps alone where there are none.
+
+    Arguments and results are those of :func:`~uni4d_fg.frontend.tracks.guided_search.move_points`.
+    """
+    if views is None:
+        return move_points(source, target, points, velocity, config)
+    return views.follow(source, target, points, velocity)
 
 
 def _is_found(

@@ -27,8 +27,7 @@ from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.bridging import Bridges
-from uni4d_fg.frontend.tracks.first_views import FirstViews, refines
-from uni4d_fg.frontend.tracks.guided_search import move_points
+from uni4d_fg.frontend.tracks.first_views import FirstViews, follow_points, refines
 from uni4d_fg.frontend.tracks.optical_flow import has_not_drifted
 from uni4d_fg.frontend.tracks.reseeding import corners_of_empty_cells
 
@@ -159,10 +158,7 @@ class _LivePoints:
 
     def move(self, source: ImageArray, target: ImageArray, config: TrackingConfig) -> None:
         """Follow all points to the next image and forget those that are lost."""
-        if self.views is None:
-            kept, moved = move_points(source, target, self.points, self.velocity, config)
-        else:
-            kept, moved = self.views.follow(source, target, self.points, self.velocity)
+        kept, moved = follow_points(self.views, source, target, self.points, self.velocity, config)
         self.track, self.points, self.velocity = self.track[kept], moved, moved - self.points[kept]
         if config.bridge_frames:
             self._bridge(target, config)

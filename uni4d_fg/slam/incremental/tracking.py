@@ -16,8 +16,7 @@ from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import Float32Array, ImageArray, IntArray, evenly_spread
 from uni4d_fg.config.cues import TrackingConfig
-from uni4d_fg.frontend.tracks.first_views import FirstViews, refines
-from uni4d_fg.frontend.tracks.guided_search import move_points
+from uni4d_fg.frontend.tracks.first_views import FirstViews, follow_points, refines
 from uni4d_fg.frontend.tracks.lucas_kanade import query_grid
 from uni4d_fg.slam.incremental.model import FrameTracks
 
@@ -34,14 +33,13 @@ class OnlineTracker:
     points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
     velocity: Float32Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
     """(N, 2) px, the last step of each point; NaN before its first one."""
-    views: FirstViews | None = None
+    views: FirstViews | None = field(init=False)
     """Of the points, if they are refined."""
     next_track: int = 0
     since_query: int = 0
 
     def __post_init__(self) -> None:
-        if refines(self.config):
-            self.views = FirstViews(self.config)
+        self.views = FirstViews(self.config) if refines(self.config) else None
 
     def advance(self, image: ImageArray) -> FrameTracks:
         """Follow the points to the next image (H, W, 3) or (H, W) uint8 and start new ones where there are none."""
@@ -49,10 +47,7 @@ class OnlineTracker:
             image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8
         )
         if self.previous is not None:
-            if self.views is None:
-                kept, moved = move_points(self.previous, gray, self.points, self.velocity, self.config)
-            else:
-                kept, moved = self.views.follow(self.previous, gray, self.points, self.velocity)
+            kept, moved = follow_points(self.views, self.previous, gray, self.points, self.velocity, self.config)
             self.track, self.points, self.velocity = self.track[kept], moved, moved - self.points[kept]
         if self.previous is None or self.since_query >= self.config.query_interval:
             self._start(gray)
