@@ -35,7 +35,8 @@ from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.lens.camera_model import CameraModel
-from uni4d_fg.slam.lens.problems import RealPixels, is_far, lens_problem, zoom_problem
+from uni4d_fg.slam.lens.problems import RealPixels, lens_problem, zoom_problem
+from uni4d_fg.slam.lens.strength import Strength, strength_of
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames
@@ -207,14 +208,11 @@ def _is_zoom(zoom: _Fitted, plain: _Fitted, best: _Fitted, judge: _Judge, config
 
 def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, config: Config) -> bool:
     """Tell whether a lens bends the image enough, for what it gains: errors of a tracker mimic a weak one."""
-    settings, lens = config.camera, camera.lens
-    if is_far(lens, settings):
+    displacement = camera.lens.displacement(camera.intrinsics, image_size)
+    strength = strength_of(camera.lens, displacement, image_size, config.camera)
+    if strength is Strength.NO_LENS:
         return False
-    displacement = lens.displacement(camera.intrinsics, image_size)
-    if not settings.min_displacement_px < displacement < np.inf:
-        return False
-    unsure = displacement < settings.sure_displacement * max(image_size)
-    return gain >= settings.min_evidence_unsure if unsure else gain > 0.0
+    return gain >= config.camera.min_evidence_unsure if strength is Strength.WEAK else gain > 0.0
 
 
 def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:

@@ -30,7 +30,7 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit
-from uni4d_fg.slam.lens.problems import is_far
+from uni4d_fg.slam.lens.strength import Strength, strength_of
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
 from uni4d_fg.slam.stages.bundle_adjustment import without_depth_prior
@@ -208,15 +208,13 @@ def is_taken(
     """
     if candidate.evidence < (settings.min_further_evidence if after_another else settings.min_evidence):
         return False
-    if not settings.min_displacement_px < candidate.displacement_px < np.inf:
+    strength = strength_of(candidate.lens, candidate.displacement_px, image_size, settings)
+    if strength is Strength.NO_LENS:
         return False
-    if is_far(candidate.lens, settings):
+    weak, little = strength is Strength.WEAK, candidate.evidence < settings.min_evidence_unsure
+    if weak and little and not after_another:
         return False
-    small = candidate.displacement_px < settings.sure_displacement * max(image_size)
-    little = candidate.evidence < settings.min_evidence_unsure
-    if small and little and not after_another:
-        return False
-    if after_another or small or little:
+    if after_another or weak or little:
         return candidate.held_out_gain > 0.0
     return candidate.held_out_gain >= -settings.max_held_out_loss
 

@@ -20,16 +20,8 @@ from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.factors.variable_types import FISHEYE_CAMERA, INTRINSICS, LANDMARK, OPENCV_CAMERA, POSE, ZOOM
 from uni4d_fg.factors.zoom import zoom_smoothness, zoomed_reprojection
-from uni4d_fg.geometry.lens import Lens, LensModel
+from uni4d_fg.geometry.lens import LensModel
 from uni4d_fg.optim.problem import Problem
-
-_FAR = 3.0
-"""A parameter that is farther from zero than so many sigmas of its prior is no lens: it makes up for what moves."""
-
-
-def is_far(lens: Lens, config: CameraConfig) -> bool:
-    """Tell whether the parameters of a lens are none that lenses have."""
-    return max(map(abs, lens.parameters), default=0.0) > _FAR * config.parameter_prior_sigma
 
 
 @dataclass(frozen=True)
