@@ -212,11 +212,11 @@ def test_points_are_followed_on_as_they_were(monkeypatch: pytest.MonkeyPatch, fa
     first = solver(fast)
     for t in range(3):
         first.add_frame(sequence.images[t], sequence.depths[t], sequence.masks[t])
-    assert (first.tracker.views is not None) is fast
+    assert (first.tracker.followed.views is not None) is fast
     again = solver(not fast)
     restore(again, state_arrays(first))
-    assert (again.tracker.views is not None) is fast
+    assert (again.tracker.followed.views is not None) is fast
     for one in (first, again):
         one.add_frame(sequence.images[3], sequence.depths[3], sequence.masks[3])
-    np.testing.assert_array_equal(again.tracker.points, first.tracker.points)
+    np.testing.assert_array_equal(again.tracker.followed.points, first.tracker.followed.points)
     np.testing.assert_array_equal(again.window.pose, first.window.pose)

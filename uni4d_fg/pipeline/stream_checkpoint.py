@@ -64,9 +64,9 @@ def state_arrays(solver: IncrementalReconstructor) -> Arrays:
     out |= {f"dynamic_observed_{name}": getattr(dynamic.observations, name) for name in _OBSERVATIONS}
     out["dynamic_depth_sigma"] = np.array(dynamic.depth_sigma)
     out |= {f"book_{name}": getattr(solver.book, name) for name in _BOOK}
-    out |= {f"tracker_{name}": getattr(tracker, name) for name in _TRACKER}
-    if tracker.views is not None:
-        out |= {f"{_FIRST_VIEWS}{name}": array for name, array in tracker.views.to_arrays().items()}
+    out |= {f"tracker_{name}": getattr(tracker.followed, name) for name in _TRACKER}
+    if tracker.followed.views is not None:
+        out |= {f"{_FIRST_VIEWS}{name}": array for name, array in tracker.followed.views.to_arrays().items()}
     out["tracker_counters"] = np.array([tracker.next_track, tracker.since_query])
     if tracker.previous is not None:
         out["tracker_previous"] = tracker.previous
@@ -127,10 +127,10 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
     for name in _BOOK:
         setattr(solver.book, name, arrays[f"book_{name}"])
     for name in _TRACKER:
-        setattr(tracker, name, arrays[f"tracker_{name}"])
+        setattr(tracker.followed, name, arrays[f"tracker_{name}"])
     # As the stream began, whether or not the C++ extension is here too.
     views = {n.removeprefix(_FIRST_VIEWS): array for n, array in arrays.items() if n.startswith(_FIRST_VIEWS)}
-    tracker.views = FirstViews.of_arrays(tracker.config, views) if views else None
+    tracker.followed.views = FirstViews.of_arrays(tracker.config, views) if views else None
     tracker.next_track, tracker.since_query = (int(n) for n in arrays["tracker_counters"].tolist())
     tracker.previous = arrays.get("tracker_previous")
     points = _points_list("pending", arrays)

@@ -145,7 +145,7 @@ def test_tracks_are_made_online() -> None:
     for t in range(sequence.num_frames):
         update = solver.add_frame(sequence.images[t], sequence.depths[t], sequence.masks[t])
         assert update.status is not FrameStatus.BRIDGED
-        assert len(solver.tracker.track) <= 500
+        assert len(solver.tracker.followed.track) <= 500
     truth = true_poses(sequence)
     assert ate(solver.finish().world_T_cam, truth) < 0.03 * path_length(truth)
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.cues import TrackingConfig
-from uni4d_fg.frontend.tracks.guided_search import move_points, search
+from uni4d_fg.frontend.tracks.guided_search import search
 from uni4d_fg.frontend.tracks.optical_flow import comes_back
 from uni4d_fg.frontend.tracks.registration import cut_templates, is_fast, register
 
@@ -124,23 +124,6 @@ class FirstViews:
         self.due -= 1
         self.select(kept)
         return kept, refined[kept]
-
-
-def follow_points(
-    views: FirstViews | None,
-    source: ImageArray,
-    target: ImageArray,
-    points: Float32Array,
-    velocity: Float32Array,
-    config: TrackingConfig,
-) -> tuple[BoolArray, Float32Array]:
-    """Move points from one gray image to the next by their first views, by steps alone where there are none.
-
-    Arguments and results are those of :func:`~uni4d_fg.frontend.tracks.guided_search.move_points`.
-    """
-    if views is None:
-        return move_points(source, target, points, velocity, config)
-    return views.follow(source, target, points, velocity)
 
 
 def _is_found(

@@ -27,7 +27,7 @@ from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.bridging import Bridges
-from uni4d_fg.frontend.tracks.first_views import FirstViews, follow_points, refines
+from uni4d_fg.frontend.tracks.followed_points import FollowedPoints
 from uni4d_fg.frontend.tracks.optical_flow import has_not_drifted
 from uni4d_fg.frontend.tracks.reseeding import corners_of_empty_cells
 
@@ -81,23 +81,23 @@ def track_grid(
     observations: _Observations = []
     steps_done, steps = 0, 2 * (num_frames - 1)
     for forwards in (True, False):
-        live = _LivePoints()
+        live = _Sweep(FollowedPoints(config))
         previous: ImageArray | None = None
         for frame in range(num_frames) if forwards else range(num_frames - 1, -1, -1):
             if should_stop is not None and should_stop():
                 raise Cancelled(f"tracking stopped at step {steps_done} of {steps}")
             image = _gray(images[frame], image_size, frame)
             if previous is not None:
-                live.move(previous, image, config)
-                observations.append((frame, live.track, live.points))
+                live.move(previous, image)
+                observations.append((frame, live.followed.track, live.followed.points))
                 steps_done += 1
                 if progress is not None:
                     progress(steps_done, steps)
             if forwards:
-                started = _new_queries(frame, image, grid, live, config)
+                started = _new_queries(frame, image, grid, live.followed.points, config)
                 queries[frame] = _Queries(queries[frame - 1].end if frame else 0, started)
                 observations.append((frame, queries[frame].tracks(), started))
-            live.start(queries[frame], image, config)
+            live.start(queries[frame], image)
             previous = image
     query_frame = np.repeat(
         np.arange(num_frames, dtype=np.int32), [len(queries[frame].points) for frame in range(num_frames)]
@@ -121,74 +121,57 @@ class _Queries:
 
 
 def _new_queries(
-    frame: int, image: ImageArray, grid: Float32Array, live: _LivePoints, config: TrackingConfig
+    frame: int, image: ImageArray, grid: Float32Array, live: Float32Array, config: TrackingConfig
 ) -> Float32Array:
-    """Return where tracks start in a frame of the forward sweep, (n, 2) px."""
-    return grid if frame % config.query_interval == 0 else corners_of_empty_cells(image, live.points, config)
+    """Return where tracks start in a frame of the forward sweep in which others are at ``live``, (n, 2) px."""
+    return grid if frame % config.query_interval == 0 else corners_of_empty_cells(image, live, config)
 
 
 @dataclass
-class _LivePoints:
-    """The points that one sweep follows at present."""
+class _Sweep:
+    """What one sweep through the video follows at present."""
 
-    track: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    points: Float32Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    velocity: Float32Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    """(N, 2) px, the last step of each point; NaN before its first one."""
+    followed: FollowedPoints
     origins: list[tuple[_Queries, ImageArray]] = field(default_factory=list)
     """Where the points started, and the image there; only for the drift check."""
-    views: FirstViews | None = None
-    """Of the points, if they are refined."""
-    bridges: Bridges | None = None
+    bridges: Bridges | None = field(init=False)
     """The points that were lost from sight, if they are looked for."""
 
-    def start(self, queries: _Queries, image: ImageArray, config: TrackingConfig) -> None:
+    def __post_init__(self) -> None:
+        config = self.followed.config
+        self.bridges = Bridges(config) if config.bridge_frames else None
+
+    def start(self, queries: _Queries, image: ImageArray) -> None:
         """Add points in the frame where they start."""
         if len(queries.points) == 0:
             return
-        self.track = np.concatenate((self.track, queries.tracks()))
-        self.points = np.concatenate((self.points, queries.points))
-        self.velocity = np.concatenate((self.velocity, np.full_like(queries.points, np.nan)))
-        if refines(config):
-            if self.views is None:
-                self.views = FirstViews(config)
-            self.views.add(image, queries.points)
-        if config.max_drift_px is not None:
+        self.followed.add(image, queries.tracks(), queries.points)
+        if self.followed.config.max_drift_px is not None:
             self.origins.append((queries, image))
 
-    def move(self, source: ImageArray, target: ImageArray, config: TrackingConfig) -> None:
-        """Follow all points to the next image and forget those that are lost."""
-        kept, moved = follow_points(self.views, source, target, self.points, self.velocity, config)
-        self.track, self.points, self.velocity = self.track[kept], moved, moved - self.points[kept]
-        if config.bridge_frames:
-            self._bridge(target, config)
-        if config.max_drift_px is None:
-            return
-        keep = np.ones(len(self.track), np.bool_)
-        alive = []
-        for queries, image in self.origins:
-            members = np.flatnonzero((self.track >= queries.first) & (self.track < queries.end))
-            first = queries.points[self.track[members] - queries.first]
-            keep[members] = has_not_drifted(image, target, first, self.points[members], config)
-            if keep[members].any():
-                alive.append((queries, image))
-        self.origins = alive
-        self.track, self.points, self.velocity = self.track[keep], self.points[keep], self.velocity[keep]
-        if self.views is not None:
-            self.views.select(keep)
+    def move(self, source: ImageArray, target: ImageArray) -> None:
+        """Follow all points to the next image, forget those that are lost, and take up those in sight again."""
+        followed = self.followed
+        followed.move(source, target)
+        if self.bridges is not None:
+            again, where = self.bridges.find(target, followed.track, followed.points)
+            if len(again):
+                followed.add(target, again, where)
+        if followed.config.max_drift_px is not None:
+            self._forget_drifted(target)
 
-    def _bridge(self, image: ImageArray, config: TrackingConfig) -> None:
-        """Take up points that are in sight again."""
-        if self.bridges is None:
-            self.bridges = Bridges(config)
-        again, where = self.bridges.find(image, self.track, self.points)
-        if len(again) == 0:
-            return
-        self.track = np.concatenate((self.track, again))
-        self.points = np.concatenate((self.points, where))
-        self.velocity = np.concatenate((self.velocity, np.full_like(where, np.nan)))
-        if self.views is not None:
-            self.views.add(image, where)
+    def _forget_drifted(self, image: ImageArray) -> None:
+        followed, config = self.followed, self.followed.config
+        keep = np.ones(len(followed.track), np.bool_)
+        alive = []
+        for queries, origin in self.origins:
+            members = np.flatnonzero((followed.track >= queries.first) & (followed.track < queries.end))
+            first = queries.points[followed.track[members] - queries.first]
+            keep[members] = has_not_drifted(origin, image, first, followed.points[members], config)
+            if keep[members].any():
+                alive.append((queries, origin))
+        self.origins = alive
+        followed.select(keep)
 
 
 def _gray(image: ImageArray, expected: tuple[int, ...] | None, frame: int) -> ImageArray:
