@@ -43,6 +43,12 @@ class CameraConfig(Section):
     zoom_observations: int = setting(60000, "Observations that a zoom is refined on, at most.", ge=1000)
     frames: int = setting(60, "Frames that the lens is found from, at most.", ge=3)
     hold_out_every: int = setting(5, "Every so many tracks, one is held out to judge the models.", ge=2)
+    sound_depth_sigma: float = setting(
+        0.04,
+        "Relative noise of the depth cue, measured beside a pinhole, up to which tracks and cue together decide on a "
+        "lens.",
+        ge=0,
+    )
     starts: tuple[float, ...] = setting((-0.3, -0.15, 0.15), "Distortions k1 from which the search starts.")
     rounds: int = setting(2, "Joint solves; between them, outliers are judged anew.", ge=1)
     relative_decrease: float = setting(

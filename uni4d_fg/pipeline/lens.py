@@ -29,16 +29,25 @@ def as_pinhole(
 ) -> tuple[Sequence, LabelledTracks, Config]:
     """Return what the stages solve: the sequence and tracks of a pinhole that does not zoom.
 
-    Intrinsics are held, as lens and zoom are theirs; those of a zoom are of its longest focal length.
+    Intrinsics are held where lens and zoom are theirs; those of a zoom are of its longest focal length. Else the
+    lens goes along with them: see :func:`goes_along`.
     """
     if camera.is_plain:
         return sequence, labelled, config
-    held = config.input.model_copy(update={"intrinsics": "fixed"})
-    return (
-        replace(sequence, intrinsics=camera.intrinsics, focal_sigma=camera.focal_sigma, lens=PINHOLE, zoom=None),
-        camera.ideal_labelled(labelled),
-        config.model_copy(update={"input": held}),
-    )
+    pinhole = replace(sequence, intrinsics=camera.intrinsics, focal_sigma=camera.focal_sigma, lens=PINHOLE, zoom=None)
+    if not goes_along(camera, sequence):
+        held = config.input.model_copy(update={"intrinsics": "fixed"})
+        config = config.model_copy(update={"input": held})
+    return pinhole, camera.ideal_labelled(labelled), config
+
+
+def goes_along(camera: CameraModel, sequence: Sequence) -> bool:
+    """Tell whether the stages may move focal lengths on, and radial distortion with them: that of a lens not given.
+
+    :meth:`CameraModel.with_intrinsics` says how it moves.
+    """
+    found = camera.lens.model in ("SIMPLE_RADIAL", "RADIAL") and camera.lens != sequence.lens
+    return found and camera.zoom is None and camera.focal_sigma is None
 
 
 def is_sought(sequence: Video | Sequence, config: Config) -> bool:

@@ -53,7 +53,7 @@ from uni4d_fg.pipeline.in_progress import MUCH, RunInProgress
 from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
-from uni4d_fg.pipeline.lens import found_camera, is_sought, known_camera, lens_step
+from uni4d_fg.pipeline.lens import found_camera, goes_along, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.loops import loop_closing, with_loops
 from uni4d_fg.pipeline.measurements import MeasurementFiles, Measurements, read_measurements
 from uni4d_fg.pipeline.repeats import Repeats
@@ -232,10 +232,14 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
         )
     )
     key, scene, motion = _stages(run, key, inputs, poses, windows, run_stage, fragments, loops, static)
+    camera_facts: list[str] = []
+    if goes_along(camera, sequence):
+        camera = camera.with_intrinsics(scene["intrinsics"])
+        camera_facts = camera.facts()
     if repeats is not None:
         scene, motion = repeats.expanded(scene), repeats.expanded(motion)
     adjusted = summary.stages["bundle_adjustment"]
-    adjusted["facts"] = [*adjusted.get("facts", []), *measured.facts]
+    adjusted["facts"] = [*adjusted.get("facts", []), *camera_facts, *measured.facts]
     _fuse(run, stage_key(key, config.fusion), labelled, scene, motion, zoom, camera.lens, static)
     reconstruction = assemble(sequence, labelled, scene, motion, camera.lens, zoom)
     write_result(folder, reconstruction)

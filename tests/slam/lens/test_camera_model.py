@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -58,3 +59,14 @@ def test_tracks_keep_what_is_not_seen() -> None:
     assert np.isnan(moved.uv[3, 1]).all()
     np.testing.assert_array_equal(tracks.uv[:, 0], PIXELS.astype(np.float32))
     assert CameraModel(K).ideal_tracks(tracks) is tracks
+
+
+@pytest.mark.parametrize("lens", [Lens("SIMPLE_RADIAL", (-0.2,)), Lens("RADIAL", (-0.25, 0.1))])
+def test_a_lens_goes_along_with_the_focal_length(lens: Lens) -> None:
+    """The same real pixels stay those of the same ideal pixels."""
+    camera, frame = CameraModel(K, lens), np.zeros(len(PIXELS), dtype=np.int64)
+    longer = K * np.array([1.1, 1.1, 1.0, 1.0])
+    moved = camera.with_intrinsics(longer)
+    np.testing.assert_allclose(moved.ideal(PIXELS, frame), camera.ideal(PIXELS, frame), atol=1e-9)
+    assert moved.lens.parameters[0] == pytest.approx(1.21 * lens.parameters[0])
+    np.testing.assert_array_equal(moved.intrinsics, longer)

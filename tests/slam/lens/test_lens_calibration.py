@@ -27,8 +27,9 @@ from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental import IncrementalReconstructor
 from uni4d_fg.slam.incremental.model import FrameTracks
-from uni4d_fg.slam.lens.calibration import LensCandidate, calibrate_lens, is_taken
+from uni4d_fg.slam.lens.calibration import calibrate_lens
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.lens_search import LensCandidate, is_taken
 
 pytest.importorskip("open3d")
 

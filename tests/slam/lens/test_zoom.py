@@ -136,10 +136,14 @@ def test_a_lens_is_no_zoom_however_loudly_tracks_ask_for_one() -> None:
     plain = scene(num_frames=20)
     assert plain.ground_truth.intrinsics is not None
     lens = Lens("SIMPLE_RADIAL", (-0.2,))
-    found = calibrated(warp_sequence(plain, plain.ground_truth.intrinsics, lens), "camera.min_zoom_evidence=0")
+    bent, loud = warp_sequence(plain, plain.ground_truth.intrinsics, lens), "camera.min_zoom_evidence=0"
+    found = calibrated(bent, loud, "camera.sound_depth_sigma=0")  # without what the depth cue says of a lens
     assert found.zoom is not None
     assert found.zoom.zoom is None
     assert found.lens.parameters[0] == pytest.approx(-0.2, abs=0.02)
+    beside_cue = calibrated(bent, loud)
+    assert beside_cue.zoom is None
+    assert beside_cue.lens.parameters[0] == pytest.approx(-0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("more", [{"seed": 2}, {"path": "forward"}])

@@ -21,7 +21,6 @@ from typing import cast
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, evenly_spread
-from uni4d_fg.config.camera import CameraConfig
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
@@ -29,11 +28,10 @@ from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
-from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, settings_of_fit
-from uni4d_fg.slam.lens.strength import Strength, strength_of
+from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, believing_the_cue, settings_of_fit
+from uni4d_fg.slam.lens.lens_search import LensCandidate, LensSearch, candidate_of
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
-from uni4d_fg.slam.stages.bundle_adjustment import without_depth_prior
 from uni4d_fg.slam.stages.depth_spread import depth_spread
 from uni4d_fg.slam.stages.observations import observations_of
 from uni4d_fg.slam.stages.scene import StaticScene
@@ -41,21 +39,6 @@ from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
 _FAR_BEYOND = 2.0
 """Spread over what counts as poor: through k1 of -0.12 sound cues have 1.7 to 2.4 %, those of networks 8 to 9 %."""
-
-
-@dataclass(frozen=True)
-class LensCandidate:
-    """One camera model that was tried."""
-
-    lens: Lens
-    intrinsics: FloatArray
-    """(4,) px."""
-    evidence: float
-    """Part of the reprojection energy that its parameters take away."""
-    held_out_gain: float
-    """Part by which the energy of held-out tracks is lower than with the model before it."""
-    displacement_px: float
-    """How far it moves a pixel of the image at most."""
 
 
 @dataclass(frozen=True)
@@ -121,15 +104,29 @@ def calibrate_lens(
 
     some = chosen(settings.observations)
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0
+    given_first = config.bundle_adjustment.first_depth_sigma
     config = settings_of_fit(config, consecutive=len(frames) == int(frames[-1]) + 1)
     fit = LensFit(config, some.without(held_out), intrinsics, run, hooks)
+    believing = replace(fit, config=believing_the_cue(config, given_first))
     if settings.model not in ("auto", "pinhole"):
         model = cast(LensModel, settings.model.upper())
         lens = _as_model(given or PINHOLE, model)
-        found = fit.refine(fit.scene(lens, intrinsics), lens, model, settings.rounds)
-        return LensCalibration(found.lens, found.intrinsics, [_candidate(found, 0.0, image_size)], fit.solves)
+        found = believing.anew(fit.refine(fit.scene(lens, intrinsics), lens, model), settings.rounds)
+        return LensCalibration(found.lens, found.intrinsics, [candidate_of(found, 0.0, image_size)], fit.solves)
 
-    pinhole = FittedLens(Lens(), fit.scene(Lens(), intrinsics))
+    judge = HeldOut(fit.config, some.without(~held_out), run, hooks)
+    search = LensSearch(fit, believing, judge, settings, image_size)
+    pinhole, candidates = FittedLens(Lens(), fit.scene(Lens(), intrinsics)), list[LensCandidate]()
+    left = _left_to_tracks(fit, pinhole.scene, config)
+    # What the cue says of a lens is looked at where it shows a trend; if it is sound, that is the last word.
+    with_cue, is_sound = None, False
+    if settings.model == "auto" and settings.zoom != "on" and not left and search.cue_shows_a_trend(pinhole):
+        with_cue = FittedLens(Lens(), believing.scene(Lens(), intrinsics))
+        is_sound = with_cue.scene.noise.depth_sigma <= settings.sound_depth_sigma
+    if with_cue is not None and is_sound:
+        found, candidates = search.beside_cue(with_cue)
+        if found is not with_cue:
+            return LensCalibration(found.lens, found.intrinsics, candidates, fit.solves)
     zoom = None
     if settings.zoom != "off":
         zooming = ZoomFit(fit, frames, chosen(settings.zoom_observations))
@@ -138,28 +135,21 @@ def calibrate_lens(
         # A lens beside a zoom is not sought.
         known = intrinsics if zoom is None or zoom.zoom is None else zoom.intrinsics
         return LensCalibration(Lens(), known, [], fit.solves, zoom=zoom)
-    note = _left_to_tracks(fit, pinhole.scene, config)
-    if note:
-        return LensCalibration(Lens(), intrinsics, [], fit.solves, note, zoom)
-    evidence = fit.probe(pinhole.scene)
-    if evidence < settings.min_evidence:
-        note = f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"
-        return LensCalibration(Lens(), intrinsics, [], fit.solves, note, zoom)
-    # Errors of a depth cue bend a valley as narrow as that. It has a say where tracks alone tell no lens.
-    stage = without_depth_prior(config.bundle_adjustment)
-    alone = replace(fit, config=config.model_copy(update={"bundle_adjustment": stage}))
-    for trial in (alone, fit):
-        judge = HeldOut(trial.config, some.without(~held_out), run, hooks)
-        best, candidates = _find_lens(trial, judge, pinhole, evidence, settings, image_size)
-        if best is not pinhole:
-            break
+    if is_sound or left:
+        return LensCalibration(Lens(), intrinsics, candidates, fit.solves, left, zoom)
+    found, candidates, evidence = search.beside_tracks(pinhole)
+    if found is pinhole and with_cue is not None:
+        found, more = search.beside_cue(with_cue)
+        candidates += more
+    note = "" if candidates else f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"
     if zoom is not None and zoom.beside_lens:
-        compared = solve_zoom(zooming, pinhole.scene, best, count, settings)
+        rival = pinhole if found.lens.is_pinhole else found
+        compared = solve_zoom(zooming, pinhole.scene, rival, count, settings)
         if compared.zoom is not None:
             return LensCalibration(Lens(), compared.intrinsics, candidates, fit.solves, zoom=compared)
         zoom = replace(zoom, notes=zoom.notes + compared.notes)
-    known = intrinsics if best is pinhole else best.intrinsics
-    return LensCalibration(best.lens, known, candidates, fit.solves, zoom=zoom)
+    known = intrinsics if found.lens.is_pinhole else found.intrinsics
+    return LensCalibration(found.lens, known, candidates, fit.solves, note, zoom)
 
 
 def _left_to_tracks(fit: LensFit, scene: StaticScene, config: Config) -> str:
@@ -174,60 +164,10 @@ def _left_to_tracks(fit: LensFit, scene: StaticScene, config: Config) -> str:
     return f"no distortion was sought beside depths that depart by {100 * spread:.0f} % from frame to frame"
 
 
-def _find_lens(
-    fit: LensFit, judge: HeldOut, pinhole: FittedLens, evidence: float, settings: CameraConfig,
-    image_size: tuple[int, int],
-) -> tuple[FittedLens, list[LensCandidate]]:  # fmt: skip
-    """Fit models of one and two parameters; return the richest that is taken, the pinhole if none, and those tried."""
-    best, candidates = pinhole, list[LensCandidate]()
-    richer: tuple[LensModel, ...] = ("SIMPLE_RADIAL", "RADIAL")
-    for model in richer:
-        start = best if candidates else fit.search(settings.starts)
-        found = fit.refine(start.scene, start.lens, model, settings.rounds)
-        if not candidates:
-            found = replace(found, evidence=evidence)
-        candidate = _candidate(found, judge.gain(found, best), image_size)
-        taken = is_taken(candidate, settings, image_size, after_another=bool(candidates))
-        candidates.append(candidate)
-        if not taken:
-            break
-        best = found
-    return best, candidates
-
-
-def is_taken(
-    candidate: LensCandidate, settings: CameraConfig, image_size: tuple[int, int], *, after_another: bool = False
-) -> bool:
-    """Tell whether the images ask for a lens: energy, distance and held-out tracks must all speak for it.
-
-    Args:
-        candidate: The lens and what it gains over the simpler one.
-        settings: Limits.
-        image_size: (height, width), px.
-        after_another: Whether the simpler one is a lens, too, and not the pinhole.
-    """
-    if candidate.evidence < (settings.min_further_evidence if after_another else settings.min_evidence):
-        return False
-    strength = strength_of(candidate.lens, candidate.displacement_px, image_size, settings)
-    if strength is Strength.NO_LENS:
-        return False
-    weak, little = strength is Strength.WEAK, candidate.evidence < settings.min_evidence_unsure
-    if weak and little and not after_another:
-        return False
-    if after_another or weak or little:
-        return candidate.held_out_gain > 0.0
-    return candidate.held_out_gain >= -settings.max_held_out_loss
-
-
 def _as_model(lens: Lens, model: LensModel) -> Lens:
     """Return a lens of a model to start from: with the parameters of another of its family, else with zeros."""
     same = lens.is_fisheye == (model == "OPENCV_FISHEYE")
     return Lens.of(model, lens.padded if same else np.zeros(4))
-
-
-def _candidate(fit: FittedLens, held_out_gain: float, image_size: tuple[int, int]) -> LensCandidate:
-    displacement = fit.lens.displacement(fit.intrinsics, image_size)
-    return LensCandidate(fit.lens, fit.intrinsics, fit.evidence, held_out_gain, displacement)
 
 
 def _static(labelled: LabelledTracks) -> BoolArray:

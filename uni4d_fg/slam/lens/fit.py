@@ -71,6 +71,12 @@ def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
     return config.model_copy(update={"bundle_adjustment": stage if consecutive else without_camera_motion(stage)})
 
 
+def believing_the_cue(config: Config, first_depth_sigma: float | None) -> Config:
+    """Return the configuration of fits that hold depth as closely from the start as bundle adjustment does."""
+    stage = config.bundle_adjustment.model_copy(update={"first_depth_sigma": first_depth_sigma})
+    return config.model_copy(update={"bundle_adjustment": stage})
+
+
 @dataclass
 class LensFit:
     """Fits camera models to the same tracks.
@@ -152,6 +158,12 @@ class LensFit:
         for _ in range(1, rounds):
             fit = replace(self._joint(self.scene(fit.lens, fit.intrinsics), fit.lens, model), evidence=fit.evidence)
         return fit
+
+    def anew(self, found: FittedLens, rounds: int) -> FittedLens:
+        """Fit the model of a lens that another fit found, from stages 1 and 2 behind it on; see :meth:`refine`."""
+        assert found.lens.model != "PINHOLE"
+        again = self.refine(self.scene(found.lens, found.intrinsics), found.lens, found.lens.model, rounds)
+        return replace(again, evidence=found.evidence)
 
     def probe(self, scene: StaticScene) -> float:
         """Return the evidence for one radial parameter at a pinhole's minimum, from a few steps without damping.
