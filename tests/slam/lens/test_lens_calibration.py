@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,14 @@ def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_pa
     assert errors["barrel"] < 1.3 * errors["straight"] + 2e-4
     result = load_reconstruction(RunFolder(tmp_path / "barrel").reconstruction)
     assert result.lens.model == "SIMPLE_RADIAL"
+    # Stage 2 moves the focal length on, and the lens goes along.
+    assert result.intrinsics[0] == pytest.approx(300.0, rel=0.01)
+    assert result.lens.parameters[0] == pytest.approx(-0.2, abs=0.01)
+    lens_fact = f"camera model SIMPLE_RADIAL, k1 {result.lens.parameters[0]:.4f}"
+    assert (
+        lens_fact
+        in json.loads((tmp_path / "barrel" / "summary.json").read_text())["stages"]["bundle_adjustment"]["facts"]
+    )
     again = reconstruct(barrel, tmp_path / "barrel", config(), resume=True)
     assert all(again.stages[name]["resumed"] for name in ("tracks", "lens", "bundle_adjustment", "nonrigid"))
     held = reconstruct(barrel, tmp_path / "barrel", config("camera.model=pinhole"), resume=True)
