@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lens_runs import calibrated, scene_behind
 
-from uni4d_fg.config.load import load_config
-from uni4d_fg.config.synthetic import SyntheticSceneConfig
-from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
-from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.camera import project
 from uni4d_fg.geometry.lens import PINHOLE, Lens
-from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
 from uni4d_fg.slam.lens.depth_trend import depth_trend
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
@@ -53,19 +48,10 @@ def test_without_depth_there_is_no_trend() -> None:
     assert depth_trend(replace(scene, observations=seen), SIZE) == 0.0
 
 
-def calibrated(lens: Lens, **more: object) -> LensCalibration:
-    config = load_config("default", [])
-    plain = {"num_frames": 20, "render_images": False, "camera_model": lens.model, "distortion": lens.parameters}
-    sequence = make_synthetic_sequence(SyntheticSceneConfig(**(plain | more)))
-    assert sequence.tracks is not None
-    labelled: LabelledTracks = label_tracks(sequence.tracks, sequence, config.labels, config.input)
-    return calibrate_lens(labelled, sequence.image_size, sequence.intrinsics, config)
-
-
 @pytest.mark.parametrize("speed", [0.2, 0.4])
 def test_a_lens_that_tracks_hardly_ask_for_is_found_beside_a_cue_that_is_sound(speed: float) -> None:
     """Distortion lowers the energy of these tracks by 0.04 % beside a loosely held cue, a fifth of what it must."""
-    found = calibrated(Lens("SIMPLE_RADIAL", (-0.12,)), camera_speed=speed)
+    found = calibrated(scene_behind(Lens("SIMPLE_RADIAL", (-0.12,)), camera_speed=speed))
     assert found.lens.model == "SIMPLE_RADIAL"
     assert found.lens.parameters[0] == pytest.approx(-0.12, abs=0.02)
     assert found.intrinsics[0] == pytest.approx(300.0, rel=0.02)  # given 315
@@ -73,6 +59,6 @@ def test_a_lens_that_tracks_hardly_ask_for_is_found_beside_a_cue_that_is_sound(s
 
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_pinhole_beside_a_cue_that_is_sound_stays_one(seed: int) -> None:
-    found = calibrated(PINHOLE, camera_speed=0.3, seed=seed)
+    found = calibrated(scene_behind(PINHOLE, camera_speed=0.3, seed=seed))
     assert found.lens == PINHOLE
     assert all(candidate.evidence < 1e-3 for candidate in found.candidates)

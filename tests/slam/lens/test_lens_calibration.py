@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lens_runs import calibrated, config, labelled, scene_behind
 
 from uni4d_fg.config.camera import CameraConfig
 from uni4d_fg.config.load import load_config
-from uni4d_fg.config.models import Config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.errors import ConfigError, DegenerateProblemError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
-from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.lens import PINHOLE, Lens
@@ -34,31 +33,14 @@ from uni4d_fg.slam.lens.lens_search import LensCandidate, is_taken
 
 pytest.importorskip("open3d")
 
-QUIET = ("output.clouds=false", "output.pictures=false")
-
-
-def config(*changes: str) -> Config:
-    return load_config("default", [*QUIET, *changes])
-
-
-def scene(lens: Lens, **more: object) -> Sequence:
-    plain = {"num_frames": 20, "render_images": False, "camera_model": lens.model, "distortion": lens.parameters}
-    return make_synthetic_sequence(SyntheticSceneConfig(**(plain | more)))
-
-
-def labelled(sequence: Sequence) -> LabelledTracks:
-    settings = config()
-    assert sequence.tracks is not None
-    return label_tracks(sequence.tracks, sequence, settings.labels, settings.input)
-
 
 @pytest.fixture(scope="module")
 def barrel() -> Sequence:
-    return scene(Lens("SIMPLE_RADIAL", (-0.2,)))
+    return scene_behind(Lens("SIMPLE_RADIAL", (-0.2,)))
 
 
 def test_barrel_distortion_is_found(barrel: Sequence) -> None:
-    found = calibrate_lens(labelled(barrel), barrel.image_size, barrel.intrinsics, config())
+    found = calibrated(barrel)
     assert found.lens.model == "SIMPLE_RADIAL"
     assert found.lens.parameters[0] == pytest.approx(-0.2, abs=0.02)
     assert found.intrinsics[0] == pytest.approx(300.0, rel=0.02)  # given 315
@@ -68,8 +50,8 @@ def test_barrel_distortion_is_found(barrel: Sequence) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_pinhole_stays_one(seed: int) -> None:
-    sequence = scene(PINHOLE, seed=seed)
-    found = calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config())
+    sequence = scene_behind(PINHOLE, seed=seed)
+    found = calibrated(sequence)
     assert found.lens == PINHOLE
     np.testing.assert_array_equal(found.intrinsics, sequence.intrinsics)
     assert len(found.solves) < 60  # of stage 1, of stage 2, and two of a few steps
@@ -86,7 +68,7 @@ def test_ideal_tracks_are_those_of_the_pinhole(barrel: Sequence) -> None:
     assert truth is not None
     real = labelled(barrel)
     ideal = CameraModel(truth, Lens("SIMPLE_RADIAL", (-0.2,))).ideal_labelled(real)
-    straight = scene(PINHOLE)
+    straight = scene_behind(PINHOLE)
     assert straight.tracks is not None
     # The same surface points are not tracked, but a straight line of the room is straight again: radii grow.
     radius = [np.linalg.norm(t.tracks.uv[t.weight > 0] - truth[2:], axis=1) for t in (real, ideal)]
@@ -97,7 +79,7 @@ def test_ideal_tracks_are_those_of_the_pinhole(barrel: Sequence) -> None:
 
 def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_path: Path) -> None:
     errors = {}
-    for name, sequence in (("straight", scene(PINHOLE)), ("barrel", barrel)):
+    for name, sequence in (("straight", scene_behind(PINHOLE)), ("barrel", barrel)):
         reconstruct(sequence, tmp_path / name, config())
         errors[name] = evaluate_run(tmp_path / name, sequence).to_dict()["trajectory"]["ate_m"]
     assert errors["barrel"] < 1.3 * errors["straight"] + 2e-4
@@ -107,10 +89,8 @@ def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_pa
     assert result.intrinsics[0] == pytest.approx(300.0, rel=0.01)
     assert result.lens.parameters[0] == pytest.approx(-0.2, abs=0.01)
     lens_fact = f"camera model SIMPLE_RADIAL, k1 {result.lens.parameters[0]:.4f}"
-    assert (
-        lens_fact
-        in json.loads((tmp_path / "barrel" / "summary.json").read_text())["stages"]["bundle_adjustment"]["facts"]
-    )
+    summary = json.loads((tmp_path / "barrel" / "summary.json").read_text())
+    assert lens_fact in summary["stages"]["bundle_adjustment"]["facts"]
     again = reconstruct(barrel, tmp_path / "barrel", config(), resume=True)
     assert all(again.stages[name]["resumed"] for name in ("tracks", "lens", "bundle_adjustment", "nonrigid"))
     held = reconstruct(barrel, tmp_path / "barrel", config("camera.model=pinhole"), resume=True)
@@ -119,7 +99,7 @@ def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_pa
 
 
 def test_a_fisheye_of_140_degrees(tmp_path: Path) -> None:
-    sequence = scene(Lens("OPENCV_FISHEYE", (0.02, -0.005, 0.0, 0.0)), focal=131.0)
+    sequence = scene_behind(Lens("OPENCV_FISHEYE", (0.02, -0.005, 0.0, 0.0)), focal=131.0)
     summary = reconstruct(sequence, tmp_path, config("camera.model=opencv_fisheye"))
     assert "depth from several views is not made of images of so wide a lens" in summary.stages["fusion"]["facts"]
     found = evaluate_run(tmp_path, sequence).to_dict()["trajectory"]
@@ -225,10 +205,10 @@ def test_a_second_parameter_needs_less_energy_and_held_out_tracks(
 @pytest.mark.parametrize("lens", [Lens("SIMPLE_RADIAL", (-0.12,)), Lens("RADIAL", (-0.25, 0.1))])
 def test_one_or_two_parameters_as_the_lens_has_them(lens: Lens) -> None:
     """A lens of one parameter alone errs by 0.7 % in the tangents of its directions where two are needed."""
-    sequence = scene(lens, num_frames=30, grid_columns=29, grid_rows=23)
+    sequence = scene_behind(lens, num_frames=30, grid_columns=29, grid_rows=23)
     truth = sequence.ground_truth.intrinsics
     assert truth is not None
-    found = calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config())
+    found = calibrated(sequence)
     assert found.lens.model == lens.model
     border = np.array([[x, 119.5] for x in np.linspace(169.5, 359.5, 20)])  # to the distance of the corners
 
@@ -242,8 +222,8 @@ def test_one_or_two_parameters_as_the_lens_has_them(lens: Lens) -> None:
 def test_a_lens_is_no_zoom() -> None:
     """A camera that moves along its view through a lens: a focal length per frame explains much of the distortion."""
     lens = Lens("RADIAL", (-0.25, 0.1))
-    sequence = scene(lens, num_frames=60, camera_speed=0.8, grid_columns=20, grid_rows=15, seed=6)
-    found = calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config())
+    sequence = scene_behind(lens, num_frames=60, camera_speed=0.8, grid_columns=20, grid_rows=15, seed=6)
+    found = calibrated(sequence)
     assert found.zoom is not None
     assert found.zoom.evidence > config().camera.min_zoom_evidence
     assert found.zoom.zoom is None

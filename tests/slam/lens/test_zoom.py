@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from lens_runs import calibrated, config, labelled
 from warping import warp_sequence
 from zooming import ramp, zoom_sequence
 
-from uni4d_fg.config.load import load_config
-from uni4d_fg.config.models import Config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.frames import no_masks
@@ -32,7 +31,7 @@ from uni4d_fg.results.labels_io import load_labels
 from uni4d_fg.results.residuals import reprojection_residuals
 from uni4d_fg.results.run import Run
 from uni4d_fg.results.run_folder import RunFolder
-from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
+from uni4d_fg.slam.lens.calibration import calibrate_lens
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import LensFit
 
@@ -41,23 +40,9 @@ pytest.importorskip("open3d")
 FRAMES = 12
 
 
-def config(*changes: str) -> Config:
-    return load_config("default", ["output.clouds=false", "output.pictures=false", *changes])
-
-
 def scene(**more: object) -> Sequence:
     small = {"num_frames": FRAMES, "grid_columns": 16, "grid_rows": 12, "query_interval": 4, "objects": "rigid"}
     return make_synthetic_sequence(SyntheticSceneConfig(**(small | {"render_images": False} | more)))
-
-
-def labelled(sequence: Sequence) -> LabelledTracks:
-    settings = config()
-    assert sequence.tracks is not None
-    return label_tracks(sequence.tracks, sequence, settings.labels, settings.input)
-
-
-def calibrated(sequence: Sequence, *changes: str) -> LensCalibration:
-    return calibrate_lens(labelled(sequence), sequence.image_size, sequence.intrinsics, config(*changes))
 
 
 @pytest.fixture(scope="module")

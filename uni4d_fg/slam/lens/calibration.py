@@ -28,7 +28,7 @@ from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
-from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit, believing_the_cue, settings_of_fit
+from uni4d_fg.slam.lens.fit import FittedLens, LensFit, settings_of_fit
 from uni4d_fg.slam.lens.lens_search import LensCandidate, LensSearch, candidate_of
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
@@ -104,29 +104,27 @@ def calibrate_lens(
 
     some = chosen(settings.observations)
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0
-    given_first = config.bundle_adjustment.first_depth_sigma
     config = settings_of_fit(config, consecutive=len(frames) == int(frames[-1]) + 1)
-    fit = LensFit(config, some.without(held_out), intrinsics, run, hooks)
-    believing = replace(fit, config=believing_the_cue(config, given_first))
+    believing = LensFit(config, some.without(held_out), intrinsics, run, hooks)
+    fit = believing.with_stage(config.bundle_adjustment.model_copy(update={"first_depth_sigma": None}))
     if settings.model not in ("auto", "pinhole"):
         model = cast(LensModel, settings.model.upper())
         lens = _as_model(given or PINHOLE, model)
         found = believing.anew(fit.refine(fit.scene(lens, intrinsics), lens, model), settings.rounds)
         return LensCalibration(found.lens, found.intrinsics, [candidate_of(found, 0.0, image_size)], fit.solves)
 
-    judge = HeldOut(fit.config, some.without(~held_out), run, hooks)
-    search = LensSearch(fit, believing, judge, settings, image_size)
-    pinhole, candidates = FittedLens(Lens(), fit.scene(Lens(), intrinsics)), list[LensCandidate]()
+    search = LensSearch(fit, believing, some.without(~held_out), settings, image_size)
+    pinhole = FittedLens(Lens(), fit.scene(Lens(), intrinsics))
     left = _left_to_tracks(fit, pinhole.scene, config)
     # What the cue says of a lens is looked at where it shows a trend; if it is sound, that is the last word.
-    with_cue, is_sound = None, False
+    with_cue, is_sound, candidates = None, False, list[LensCandidate]()
     if settings.model == "auto" and settings.zoom != "on" and not left and search.cue_shows_a_trend(pinhole):
         with_cue = FittedLens(Lens(), believing.scene(Lens(), intrinsics))
-        is_sound = with_cue.scene.noise.depth_sigma <= settings.sound_depth_sigma
-    if with_cue is not None and is_sound:
-        found, candidates = search.beside_cue(with_cue)
-        if found is not with_cue:
-            return LensCalibration(found.lens, found.intrinsics, candidates, fit.solves)
+        is_sound = search.is_sound(with_cue)
+        if is_sound:
+            found, candidates = search.beside_cue(with_cue)
+            if not found.lens.is_pinhole:
+                return LensCalibration(found.lens, found.intrinsics, candidates, fit.solves)
     zoom = None
     if settings.zoom != "off":
         zooming = ZoomFit(fit, frames, chosen(settings.zoom_observations))
@@ -138,7 +136,7 @@ def calibrate_lens(
     if is_sound or left:
         return LensCalibration(Lens(), intrinsics, candidates, fit.solves, left, zoom)
     found, candidates, evidence = search.beside_tracks(pinhole)
-    if found is pinhole and with_cue is not None:
+    if found.lens.is_pinhole and with_cue is not None:
         found, more = search.beside_cue(with_cue)
         candidates += more
     note = "" if candidates else f"distortion would lower the reprojection energy by {100 * evidence:.2f} %"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.geometry.camera import seen_from
+from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.scene import StaticScene
 
 _FAR_OFF = 0.5
@@ -47,6 +48,6 @@ def depth_trend(scene: StaticScene, image_size: tuple[int, int]) -> float:
         depart = off - (np.bincount(frame, weight * off) / total)[frame]
         slope = float(np.sum(weight * depart * across) / max(np.sum(weight * across**2), 1e-300))
         residual = depart - slope * across
-        sigma = max(1.4826 * float(np.median(np.abs(residual))), _EXACT)
+        sigma = max(robust_sigma(residual), _EXACT)
         weight = 1.0 / (1.0 + (residual / (2.0 * sigma)) ** 2)
     return slope

@@ -9,6 +9,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.errors import Cancelled, DegenerateProblemError, SolverError
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import LANDMARK, LOG_SCALE, POSE
@@ -63,18 +64,11 @@ class FittedLens:
 def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
     """Return the configuration of stages 1 and 2 for fits: cameras only, E_cam only between consecutive frames.
 
-    All tracks take part, and depth is held loosely from the start: where a cue contradicts the tracks, distortion would
-    seem to take away energy.
+    All tracks take part.
     """
-    changes = {"structure": "keep", "covariance_cells": 0, "trim_sigmas": None, "first_depth_sigma": None}
+    changes = {"structure": "keep", "covariance_cells": 0, "trim_sigmas": None}
     stage = config.bundle_adjustment.model_copy(update=changes)
     return config.model_copy(update={"bundle_adjustment": stage if consecutive else without_camera_motion(stage)})
-
-
-def believing_the_cue(config: Config, first_depth_sigma: float | None) -> Config:
-    """Return the configuration of fits that hold depth as closely from the start as bundle adjustment does."""
-    stage = config.bundle_adjustment.model_copy(update={"first_depth_sigma": first_depth_sigma})
-    return config.model_copy(update={"bundle_adjustment": stage})
 
 
 @dataclass
@@ -94,6 +88,10 @@ class LensFit:
     run: StageRunner
     hooks: Hooks | None = None
     solves: list[SolveSummary] = field(default_factory=list)
+
+    def with_stage(self, stage: BundleAdjustmentConfig) -> LensFit:
+        """Return what fits the same tracks with another bundle adjustment; their solves are noted together."""
+        return replace(self, config=self.config.model_copy(update={"bundle_adjustment": stage}))
 
     def scene(self, lens: Lens, intrinsics: FloatArray) -> StaticScene:
         """Run stages 1 and 2 with a lens that is undone beforehand.

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.camera import CameraConfig
-from uni4d_fg.geometry.lens import Lens, LensModel
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.slam.lens.depth_trend import depth_trend
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit
 from uni4d_fg.slam.lens.strength import Strength, strength_of
@@ -45,7 +46,8 @@ class LensSearch:
     """Holds the depth cue loosely: where it contradicts the tracks, distortion would seem to take away energy."""
     believing: LensFit
     """Holds it as bundle adjustment does: it tells the focal length, which a lens leaves open to tracks."""
-    judge: HeldOut
+    held_out: LabelledTracks
+    """What models are compared by, on real pixels."""
     settings: CameraConfig
     image_size: tuple[int, int]
 
@@ -59,15 +61,14 @@ class LensSearch:
             DegenerateProblemError: If the cues do not determine the cameras.
             SolverError: If a system is singular or a cue is not finite.
         """
-        candidates = list[LensCandidate]()
         evidence = self.fit.probe(pinhole.scene)
         if evidence < self.settings.min_evidence:
-            return pinhole, candidates, evidence
+            return pinhole, [], evidence
+        candidates: list[LensCandidate] = []
         # Errors of a depth cue bend a valley as narrow as that. It has a say where tracks alone tell no lens.
-        stage = without_depth_prior(self.fit.config.bundle_adjustment)
-        alone = replace(self.fit, config=self.fit.config.model_copy(update={"bundle_adjustment": stage}))
+        alone = self.fit.with_stage(without_depth_prior(self.fit.config.bundle_adjustment))
         for trial in (alone, self.fit):
-            judge = replace(self.judge, config=trial.config)
+            judge = self._judge_of(trial)
             start = trial.search(self.settings.starts)
             first = trial.refine(start.scene, start.lens, "SIMPLE_RADIAL", self.settings.rounds)
             candidates = [candidate_of(replace(first, evidence=evidence), judge.gain(first, pinhole), self.image_size)]
@@ -78,8 +79,11 @@ class LensSearch:
 
     def cue_shows_a_trend(self, pinhole: FittedLens) -> bool:
         """Tell whether the depth cue departs from a pinhole's landmarks toward the corners as a lens makes it."""
-        is_sound = pinhole.scene.noise.depth_sigma <= self.settings.sound_depth_sigma
-        return abs(depth_trend(pinhole.scene, self.image_size)) > (_SOUND_TREND if is_sound else _TREND)
+        return abs(depth_trend(pinhole.scene, self.image_size)) > (_SOUND_TREND if self.is_sound(pinhole) else _TREND)
+
+    def is_sound(self, pinhole: FittedLens) -> bool:
+        """Tell whether the noise of the depth cue beside a pinhole is so low that the cue has the last word."""
+        return pinhole.scene.noise.depth_sigma <= self.settings.sound_depth_sigma
 
     def beside_cue(self, pinhole: FittedLens) -> tuple[FittedLens, list[LensCandidate]]:
         """Return the lens that tracks and depth cue ask for together, the pinhole if there is none, and what was tried.
@@ -98,7 +102,7 @@ class LensSearch:
         soon = trial.config.camera.model_copy(update={"relative_decrease": _SOON})
         quick = replace(trial, config=trial.config.model_copy(update={"camera": soon}))
         first = quick.refine(pinhole.scene, Lens(), "SIMPLE_RADIAL")
-        judge = replace(self.judge, config=trial.config)
+        judge = self._judge_of(trial)
         candidates = [candidate_of(first, judge.gain(first, pinhole), self.image_size)]
         enough = candidates[0].evidence >= _MIN_EVIDENCE and candidates[0].held_out_gain > 0.0
         # Things that move without a mask asked for k1 = 1.2 on seven tiny frames.
@@ -110,11 +114,13 @@ class LensSearch:
 
     def _richer(self, trial: LensFit, judge: HeldOut, first: FittedLens, candidates: list[LensCandidate]) -> FittedLens:
         """Add a second radial parameter where it is asked for; the candidate is appended to those there are."""
-        model: LensModel = "RADIAL"
-        second = trial.refine(first.scene, first.lens, model, self.settings.rounds)
+        second = trial.refine(first.scene, first.lens, "RADIAL", self.settings.rounds)
         candidates.append(candidate_of(second, judge.gain(second, first), self.image_size))
         taken = is_taken(candidates[-1], self.settings, self.image_size, after_another=True)
         return second if taken else first
+
+    def _judge_of(self, trial: LensFit) -> HeldOut:
+        return HeldOut(trial.config, self.held_out, trial.run, trial.hooks)
 
 
 def is_taken(
