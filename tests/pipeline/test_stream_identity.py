@@ -13,7 +13,7 @@ from stream_samples import stream, stream_config
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
 from uni4d_fg.pipeline.stream import stream_sequence
-from uni4d_fg.pipeline.warnings import scene_warnings
+from uni4d_fg.pipeline.warnings import open_focal_warnings, scene_warnings
 
 FRAMES, TAKEN = 10, 6
 CONFIG = stream_config("incremental.window=4", "incremental.nonrigid_lag=2", "incremental.nonrigid_window=5")
@@ -100,6 +100,23 @@ def test_a_camera_at_rest_determines_its_focal_length_if_it_turns(sigma_px: floa
     covariance = np.diag([sigma_px**2, sigma_px**2, 0.0, 0.0])
     found = scene_warnings(given, given, still, np.array([[0.0, 0.0, 5.0]]), None, covariance)
     assert ["focal length is poorly determined" in text for text in found] == [poor]
+
+
+@pytest.mark.parametrize(
+    ("sigma_px", "baseline", "said"),
+    [(0.0, 1.0, False), (4.0, 1.0, False), (12.0, 1.0, True), (12.0, 0.0, False), (np.nan, 1.0, False)],
+)
+def test_a_focal_length_that_is_known_badly_is_said_with_its_interval(
+    sigma_px: float, baseline: float, said: bool
+) -> None:
+    intrinsics, poses = np.array([160.0, 160.0, 80.0, 60.0]), np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = np.linspace(0.0, baseline, 3)
+    covariance = np.diag([sigma_px**2, sigma_px**2, 0.0, 0.0])
+    points = np.array([[0.0, 0.0, 5.0]])
+    found = open_focal_warnings(intrinsics, covariance, poses, points)
+    assert ["160 px was found, give or take 15 % (95 %)" in text for text in found] == ([True] if said else [])
+    assert open_focal_warnings(intrinsics, None, poses, points) == []
+    assert open_focal_warnings(intrinsics, covariance, poses, points[:0]) == []
 
 
 def test_a_stream_without_static_tracks_says_so(tmp_path: Path) -> None:

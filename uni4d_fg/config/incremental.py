@@ -66,7 +66,10 @@ class IncrementalConfig(Section):
     noise_smoothing: float = setting(
         0.1, "Part of the newest measurement of the noise in its running mean, once the window is full.", gt=0, le=1
     )
-    solver: SolverConfig = setting(SolverConfig(max_iterations=6, relative_decrease=1e-3), "Solver of the window.")
+    solver: SolverConfig = setting(
+        SolverConfig(max_iterations=6, relative_decrease=1e-3, initial_damping=1e-8),
+        "Solver of the window; it starts near its minimum, where damping would only hold the focal lengths.",
+    )
     pose_solver: SolverConfig = setting(
         SolverConfig(max_iterations=15, relative_decrease=1e-4), "Solver of a new frame's pose, landmarks held."
     )

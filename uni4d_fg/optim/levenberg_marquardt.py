@@ -18,6 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+import numpy as np
+
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import SolverError
 from uni4d_fg.optim.objective import CurvedObjective, Objective, Step
@@ -157,7 +159,9 @@ def minimize(
 
 def _evaluate(objective: Objective[StateT], state: StateT, clock: _Clock) -> dict[str, float]:
     began = time.perf_counter()
-    energies = objective.energies(state)
+    # A step may lead where a factor is not defined, such as to a negative focal length: it is rejected, not warned of.
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        energies = objective.energies(state)
     clock.add("evaluate", began)
     return energies
 

@@ -11,7 +11,9 @@ _MAX_FOCAL_CHANGE = 0.15
 _MIN_BASELINE = 0.01
 """Of the scene's depth."""
 _MAX_FOCAL_SIGMA = 0.04
-"""Standard deviation, of the focal length, above which it counts as poorly determined."""
+"""Standard deviation, as a part of the focal length, above which it counts as poorly determined."""
+_WITHIN = 1.96
+"""So many sigmas hold 95 % of a normal distribution."""
 _MAX_UNCERTAINTY = 0.05
 """Root mean square of the positions' sigmas, of the path's length: a path that may be off by a twentieth of itself."""
 
@@ -92,10 +94,8 @@ def scene_warnings(
     warnings = focal_warnings(given_intrinsics, intrinsics[:2])
     if not len(landmarks):
         return [*warnings, "there are no landmarks: the cameras rest on nothing that was measured"]
-    first = world_T_cam[0, :3, 3]
-    baseline = float(np.linalg.norm(world_T_cam[:, :3, 3] - first, axis=1).max())
-    depth = float(np.median(np.linalg.norm(landmarks - first, axis=1)))
-    if baseline < _MIN_BASELINE * depth:
+    baseline, depth = _extent(world_T_cam, landmarks)
+    if hardly_moves(world_T_cam, landmarks):
         text = f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
         text += "depth comes from the cue alone"
         # A camera that turns on the spot determines its focal length; one that is held needs no determining.
@@ -112,6 +112,39 @@ def scene_warnings(
                 "static is seen well; look at masks, tracks and the share of the image that moves"
             )
     return warnings
+
+
+def open_focal_warnings(
+    intrinsics: FloatArray, intrinsics_covariance: FloatArray | None, world_T_cam: FloatArray, landmarks: FloatArray
+) -> list[str]:
+    """Return a sentence if focal lengths that were solved for are known badly though the camera moves.
+
+    A camera that hardly moves is warned of by :func:`scene_warnings`. The arguments are as there.
+    """
+    if intrinsics_covariance is None or hardly_moves(world_T_cam, landmarks):
+        return []
+    sigma = float((np.sqrt(np.diagonal(intrinsics_covariance)[:2]) / intrinsics[:2]).max())
+    if not sigma > _MAX_FOCAL_SIGMA:  # nor where it is not known
+        return []
+    return [
+        f"this video leaves the focal length open: {intrinsics[:2].mean():.0f} px was found, give or take "
+        f"{100 * _WITHIN * sigma:.0f} % (95 %); depth, and motion along the viewing direction, stretch with it; "
+        "set input.intrinsics=fixed if the given one is known"
+    ]
+
+
+def hardly_moves(world_T_cam: FloatArray, landmarks: FloatArray) -> bool:
+    """Return whether poses (T, 4, 4) lie within a small part of the distance to landmarks (N, 3); so without any."""
+    baseline, depth = _extent(world_T_cam, landmarks)
+    return not baseline >= _MIN_BASELINE * depth
+
+
+def _extent(world_T_cam: FloatArray, landmarks: FloatArray) -> tuple[float, float]:
+    """Return the largest distance from the first camera to another, and the median one to the landmarks (or inf)."""
+    first = world_T_cam[0, :3, 3]
+    baseline = float(np.linalg.norm(world_T_cam[:, :3, 3] - first, axis=1).max())
+    depth = float(np.median(np.linalg.norm(landmarks - first, axis=1))) if len(landmarks) else np.inf
+    return baseline, depth
 
 
 def _determine_focal(covariance: FloatArray, intrinsics: FloatArray) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import FloatArray
-from uni4d_fg.config.solver import KernelConfig
+from uni4d_fg.config.solver import KernelConfig, SolverConfig
 from uni4d_fg.config.stages import AccelerationConfig, BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch
@@ -48,6 +48,9 @@ from uni4d_fg.slam.stages.structure import (
 )
 from uni4d_fg.slam.stages.terms import camera_motion_terms, intrinsics_priors
 
+_NEAR_DAMPING = 1e-8
+"""First damping of a solve that starts near its minimum: more holds focal lengths, along which the energy is nearly
+flat, and the solve ends before they have moved."""
 _FIRST_DEPTH_KERNEL = KernelConfig(kind="cauchy", threshold=1.0)
 """Of the first solve: a track beside an edge moves with what is in front and may have the depth behind, and among small
 things half of all do. A kernel that holds on to them bends the cameras."""
@@ -195,7 +198,7 @@ def adjust_bundle(
         if index == 1 and freedom.poses and motion.is_weak:
             motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
             problem = declare(noise, config)
-        stage = Stage("bundle_adjustment", problem, config.solver)
+        stage = Stage("bundle_adjustment", problem, config.solver if index == 0 else near_the_minimum(config.solver))
         state, summary = run(stage, state, hooks)
         solves.append(summary)
         if summary.termination is Termination.CANCELLED:
@@ -245,6 +248,11 @@ def adjust_bundle(
         *covariances, solves, dropped, acceleration=motion if energy.is_likelihood else None,
     )  # fmt: skip
     return scene if merged is None else merged.split(scene)
+
+
+def near_the_minimum(solver: SolverConfig) -> SolverConfig:
+    """Return the options of a solve that starts near its minimum."""
+    return solver.model_copy(update={"initial_damping": min(solver.initial_damping, _NEAR_DAMPING)})
 
 
 def held_to_the_cue(noise: StaticNoise, config: BundleAdjustmentConfig) -> tuple[StaticNoise, BundleAdjustmentConfig]:
