@@ -61,7 +61,7 @@ def unmasked_motion_warnings(
         return []
     return [
         f"{100 * share:.0f} % of the static tracks lie together and fit no static world: something seems to move, and "
-        "no mask covers it; give masks, or let them be made from motion"
+        "no mask covers it; give masks, or have them made from motion (--masks motion)"
     ]
 
 

@@ -136,7 +136,8 @@ _FOCAL_IS_OPEN = "the camera zooms, and tracks hardly determine its focal length
 
 _ONLY_PART = (
     "part of the tracks asks for a focal length that changes, and others contradict it (it explains {:.0f} % of them "
-    "better), so none was taken: something may move that no mask covers; give masks, or camera.zoom=on if it zooms"
+    "better), so none was taken: something may move that no mask covers; give masks, or have them made from motion "
+    "(--masks motion), or set camera.zoom=on if it zooms"
 )
 
 
