@@ -16,7 +16,7 @@ import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGE = CHECKOUT / "uni4d_fg"
-ROOT_MODULES = {"allocation", "arrays", "counted", "errors", "files", "optional", "progress", "reading"}
+ROOT_MODULES = {"allocation", "arrays", "counted", "errors", "files", "optional", "progress", "reading", "robust"}
 FRONT_DOORS = {"", "__main__"}
 """What a user imports, or starts, may come from anywhere."""
 WINGS = ("geometry", "config", "factors", "optim", "frontend", "slam", "cues", "results", "pipeline", "cli")

@@ -38,7 +38,7 @@ from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
-from uni4d_fg.slam.stages.noise import robust_sigma
+from uni4d_fg.robust import robust_sigma
 
 _CONVERGED = 1e-5
 """A change below this part of the solution ends the reweighted solves."""

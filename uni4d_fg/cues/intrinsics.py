@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.robust import robust_sigma
 
 _TUKEY = 4.685
 """Sigmas beyond which a value does not count: 95 % efficient on normal noise."""
-_GAUSSIAN = 1.4826
 _ROUNDS = 20
 _SMALL = 1e-9
 _SPREAD_TO_WARN = 0.05
@@ -61,7 +61,7 @@ def shared_intrinsics(per_frame: FloatArray) -> SharedIntrinsics | None:
 def robust_mean(values: FloatArray) -> tuple[float, float]:
     """Return the mean of (N,) values with Tukey's weights, and their robust standard deviation."""
     center = float(np.median(values))
-    sigma = _GAUSSIAN * float(np.median(np.abs(values - center)))
+    sigma = robust_sigma(values - center)
     if sigma < _SMALL:
         return center, sigma
     for _ in range(_ROUNDS):

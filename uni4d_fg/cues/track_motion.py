@@ -21,6 +21,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray, evenl
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.robust import MAD_TO_SIGMA
 from uni4d_fg.slam.stages.scene import Cameras
 
 _MEDIAN_OF_CHI2 = 1.386
@@ -265,7 +266,7 @@ def _fit_shared(
         coefficients = np.asarray(np.linalg.solve(normal, weighted @ chosen), np.float64)
         off = chosen - terms @ coefficients
         miss = np.hypot(off[..., 0], off[..., 1]) * inverse
-        scale = np.maximum(1.5 * 1.4826 * _medians(np.where(absent, np.inf, miss), count), 1e-6)
+        scale = np.maximum(1.5 * MAD_TO_SIGMA * _medians(np.where(absent, np.inf, miss), count), 1e-6)
         weight = inverse**2 / (1.0 + (miss / scale[:, None]) ** 2) ** 2
     found: list[SharedError | None] = [None] * len(motions)
     for row, n in enumerate(fitted):

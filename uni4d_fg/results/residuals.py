@@ -14,9 +14,8 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, rows_by_group
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.reconstruction import Reconstruction
-
-_GAUSSIAN_MEDIAN = 1.4826
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def landmark_sigma(reconstruction: Reconstruction, residuals: Residuals) -> Floa
     count = len(reconstruction.landmarks)
     if len(row) == 0:
         return np.full(count, np.inf)
-    sigma = _GAUSSIAN_MEDIAN * float(np.median(np.abs(residuals.error[static])))
+    sigma = robust_sigma(residuals.error[static])
     poses = reconstruction.world_T_cam[frame]
     x = world_to_camera(poses, reconstruction.landmarks[row])
     fx, fy = reconstruction.frame_intrinsics[frame, :2].T

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uni4d_fg.slam.stages.noise import intraclass_correlation, robust_sigma
+from uni4d_fg.robust import robust_sigma
+from uni4d_fg.slam.stages.noise import intraclass_correlation
 from uni4d_fg.slam.stages.scene import StaticNoise
 
 

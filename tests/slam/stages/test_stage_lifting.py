@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from stage_samples import K, camera_path, hide, observe, static_observations, static_points
 
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.lifting import frame_log_scales, lift, mean_per_row
-from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.scene import Cameras
 
 

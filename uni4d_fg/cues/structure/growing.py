@@ -24,13 +24,13 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import Termination
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
     without_camera_motion,
     without_depth_prior,
 )
-from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 

@@ -19,13 +19,13 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.wide_window import averaged, nodes, resized, sigma_on
+from uni4d_fg.robust import MAD_TO_SIGMA
 
 _MAX_SAMPLES = 4000
 _ITERATIONS = 12
 _SETTLED = 1e-4
 """Relative change of an affine error that is no change."""
 _MIN_SAMPLES = 12
-_MAD = 1.4826
 _SHIFT_SIGMA = 0.08
 """Standard deviation of the shift, of the median inverse depth, before anything is seen."""
 _INDEPENDENT = 30
@@ -90,7 +90,7 @@ def fit_affine(
     relative, mass = weight / wanted**2, float(weight.sum())
     left = _log_left(a, b, inverse, log_depth)
     for _ in range(_ITERATIONS):
-        sigma = max(_MAD * median(np.abs(left)), 1e-4)
+        sigma = max(MAD_TO_SIGMA * median(np.abs(left)), 1e-4)
         w = relative / (1.0 + (left / (2.0 * sigma)) ** 2) ** 2
         # One more sample, of no inverse depth at none: without evidence there is no shift.
         least = (sigma / (shift_sigma * typical)) ** 2 * mass / _INDEPENDENT
@@ -108,7 +108,7 @@ def fit_affine(
         left = _log_left(a, b, inverse, log_depth)
         if done:
             break
-    return a, b, _MAD * median(np.abs(left))
+    return a, b, MAD_TO_SIGMA * median(np.abs(left))
 
 
 def _log_left(a: float, b: float, inverse: FloatArray, log_depth: FloatArray) -> FloatArray:

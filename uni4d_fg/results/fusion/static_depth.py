@@ -17,6 +17,7 @@ from uni4d_fg.results.fusion.log_range import log_range
 from uni4d_fg.results.fusion.multiview.measured import Measured
 from uni4d_fg.results.fusion.wide_window import blurred
 from uni4d_fg.results.nearest import from_nearest
+from uni4d_fg.robust import robust_sigma
 
 _LANDMARK_SIGMA = 0.006
 """Standard deviation of a landmark's log depth in a frame."""
@@ -137,7 +138,7 @@ def known_depth(
         if np.count_nonzero(sure) >= _MIN_COMPARED:
             difference = log_depth[at][sure] - log_z[sure]
             difference -= np.median(difference)
-            spread = 1.4826 * float(np.median(np.abs(difference)))
+            spread = robust_sigma(difference)
             shared = float(np.sqrt(max(spread**2 - _LANDMARK_SIGMA**2, 0.0)))
             agreeing = float(np.mean(np.abs(difference) < _AGREES))
             reliability = float(np.clip((agreeing - _AT_WORST) / (_AT_BEST - _AT_WORST), 0.0, 1.0))
@@ -327,9 +328,9 @@ def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tup
     if not usable.any():
         return np.full_like(log_cue, 0.05), np.full_like(log_cue, _USUALLY_RIGHT)
     if known.reliability < _JUDGES:
-        usual = 1.4826 * float(np.median(left[usable]))
+        usual = robust_sigma(left[usable])
         return np.full_like(log_cue, max(usual, _LEAST_SIGMA)), np.full_like(log_cue, _USUALLY_RIGHT)
-    usual = 1.4826 * float(np.median(left[usable]))
+    usual = robust_sigma(left[usable])
     wrong = usable & (left > 4.0 * usual + 0.02)
     near = cv2.GaussianBlur(np.dstack((usable, wrong)).astype(np.float32), (0, 0), _NEARBY_PX)
     count, failures = near[..., 0], near[..., 1]

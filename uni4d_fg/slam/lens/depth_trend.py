@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.geometry.camera import seen_from
-from uni4d_fg.slam.stages.noise import robust_sigma
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.scene import StaticScene
 
 _FAR_OFF = 0.5

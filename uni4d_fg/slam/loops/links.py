@@ -20,6 +20,7 @@ from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.loops import LoopsConfig
 from uni4d_fg.factors.static_reprojection import static_reprojection_jacobian
 from uni4d_fg.geometry import se3
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.loops.places import Place
 
 _CELLS = 4
@@ -167,7 +168,7 @@ class _Pair:
     def information(self, guess: _Guess, inlier: BoolArray, cells: int) -> FloatArray:
         """Return the information (6, 6) of the pose from the inliers, of the spread that their residuals have."""
         r, j = self.linearized(guess)
-        sigma = max(_MIN_SIGMA_PX, 1.4826 * float(np.median(np.abs(r[inlier]))))
+        sigma = max(_MIN_SIGMA_PX, robust_sigma(r[inlier]))
         # One of the two ways: both read the same pixels.
         known = 0.5 * np.einsum("nsra,nsrb->ab", j[inlier], j[inlier]) * min(1.0, cells / inlier.sum())
         hessian = known / sigma**2 + _SCALE_PRIOR

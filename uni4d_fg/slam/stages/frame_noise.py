@@ -9,7 +9,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray, rows_by_group
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.factors.state import State
-from uni4d_fg.slam.stages.noise import robust_sigma
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.static_outliers import reprojection_residual
 

@@ -16,7 +16,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread, rows_by_group
 from uni4d_fg.geometry.nearest_points import NearestPoints
 from uni4d_fg.optim.threads import map_in_order, thread_count
-from uni4d_fg.slam.stages.noise import robust_sigma
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 
 _DIRECTIONS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])

@@ -23,9 +23,9 @@ from uni4d_fg.config.stages import NonRigidConfig
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.depth_prior import dynamic_depth_prior, log_depth
 from uni4d_fg.geometry.camera import seen_from
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.energy import Energy
 from uni4d_fg.slam.stages.lifting import frame_log_scales
-from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras
 

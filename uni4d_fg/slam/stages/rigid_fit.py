@@ -26,8 +26,8 @@ from uni4d_fg.optim.marginals import camera_marginals, reduced_hessian
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.energy import kernel_of
-from uni4d_fg.slam.stages.noise import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.rigid_start import RigidBody
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import dijkstra
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import camera_to_world, world_to_camera
-from uni4d_fg.slam.stages.noise import robust_sigma
+from uni4d_fg.robust import robust_sigma
 
 _REWEIGHTINGS = 15
 

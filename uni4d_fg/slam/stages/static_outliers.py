@@ -10,7 +10,8 @@ from uni4d_fg.factors.depth_prior import log_depth
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, seen_from
-from uni4d_fg.slam.stages.noise import intraclass_correlation, robust_sigma
+from uni4d_fg.robust import robust_sigma
+from uni4d_fg.slam.stages.noise import intraclass_correlation
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import StaticNoise
 
