@@ -15,7 +15,8 @@ from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POS
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry import se3
 from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.summary import Termination
+from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, adjust_bundle
 from uni4d_fg.slam.stages.energy import MAP, Energy, PaperEnergy
 from uni4d_fg.slam.stages.observations import Observations
@@ -201,6 +202,38 @@ def test_a_sound_cue_is_believed_where_tracks_that_drift_tell_another_focal_leng
             errors.append(abs(float(np.log(found.cameras.intrinsics[0] / K[0]))))
     assert np.mean(error[0.07]) < 0.03
     assert np.mean(error[0.07]) < 0.7 * np.mean(error[None])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_last_solve_ends_where_the_focal_length_has_its_minimum(seed: int) -> None:
+    """A camera that goes past a scene: the energy is nearly flat along the focal length, which damping would hold."""
+    rng, part = np.random.default_rng(seed), np.linspace(0.0, 1.0, FRAMES)
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, 0, 3] = 0.3 * part
+    poses[:, :3, :3] = se3.so3_exp(np.outer(part, [0.0, -0.02, 0.0]))
+    off = rng.normal(scale=0.3, size=(150, 1, 2)) * part[:, None] + rng.normal(scale=0.2, size=(150, FRAMES, 2))
+    seen = static_observations(shift(observe(static_points(rng, 150), poses), off.astype(np.float32)))
+    ends: list[tuple[float, float]] = []
+
+    def run(stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:
+        def log_focal(start: State, **options: float) -> float:
+            again = dataclasses.replace(stage, solver=stage.solver.model_copy(update=options))
+            return float(np.log(run_stage(again, start)[0][INTRINSICS][0, 0]))
+
+        end, summary = run_stage(stage, state, hooks)
+        if stage.kind == "bundle_adjustment":
+            minimum = log_focal(end, relative_decrease=1e-12, max_iterations=300)
+            found = float(np.log(end[INTRINSICS][0, 0]))
+            ends.append((abs(found - minimum), abs(log_focal(state, initial_damping=1e-4) - minimum)))
+        return end, summary
+
+    guess = K * np.array([1.1, 1.1, 1.0, 1.0])
+    settings = BundleAdjustmentConfig(focal_prior_fraction=0.5)
+    result = adjust_bundle(seen, Cameras(poses, guess, np.zeros(FRAMES)), guess, settings, Freedom(True, True), run=run)
+    sigma = float(np.sqrt(result.intrinsics_covariance[0, 0]) / result.cameras.intrinsics[0])
+    hardly_damped, damped = ends[-1]
+    assert hardly_damped < 0.3 * sigma
+    assert damped > 0.5 * sigma
 
 
 def test_isolated_landmarks_are_dropped_and_counted(rng: np.random.Generator) -> None:
