@@ -13,7 +13,7 @@ from stream_samples import stream, stream_config
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
 from uni4d_fg.pipeline.stream import stream_sequence
-from uni4d_fg.pipeline.warnings import open_focal_warnings, scene_warnings
+from uni4d_fg.pipeline.warnings import scene_warnings
 
 FRAMES, TAKEN = 10, 6
 CONFIG = stream_config("incremental.window=4", "incremental.nonrigid_lag=2", "incremental.nonrigid_window=5")
@@ -113,10 +113,16 @@ def test_a_focal_length_that_is_known_badly_is_said_with_its_interval(
     poses[:, 0, 3] = np.linspace(0.0, baseline, 3)
     covariance = np.diag([sigma_px**2, sigma_px**2, 0.0, 0.0])
     points = np.array([[0.0, 0.0, 5.0]])
-    found = open_focal_warnings(intrinsics, covariance, poses, points)
+
+    def open_focal_warnings(covariance: np.ndarray | None, points: np.ndarray, *, doubted: bool = False) -> list[str]:
+        found = scene_warnings(intrinsics, intrinsics, poses, points, None, covariance, focal_was_doubted=doubted)
+        return [text for text in found if "leaves the focal length open" in text]
+
+    found = open_focal_warnings(covariance, points)
     assert ["160 px was found, give or take 15 % (95 %)" in text for text in found] == ([True] if said else [])
-    assert open_focal_warnings(intrinsics, None, poses, points) == []
-    assert open_focal_warnings(intrinsics, covariance, poses, points[:0]) == []
+    assert open_focal_warnings(None, points) == []
+    assert open_focal_warnings(covariance, points[:0]) == []
+    assert open_focal_warnings(covariance, points, doubted=True) == []
 
 
 def test_a_stream_without_static_tracks_says_so(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from uni4d_fg.config.base import Section, setting
-from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.config.solver import NEAR_DAMPING, SolverConfig
 from uni4d_fg.config.stages import CameraMotionConfig
 
 
@@ -67,7 +67,7 @@ class IncrementalConfig(Section):
         0.1, "Part of the newest measurement of the noise in its running mean, once the window is full.", gt=0, le=1
     )
     solver: SolverConfig = setting(
-        SolverConfig(max_iterations=6, relative_decrease=1e-3, initial_damping=1e-8),
+        SolverConfig(max_iterations=6, relative_decrease=1e-3, initial_damping=NEAR_DAMPING),
         "Solver of the window; it starts near its minimum, where damping would only hold the focal lengths.",
     )
     pose_solver: SolverConfig = setting(

@@ -6,6 +6,10 @@ from typing import Literal
 
 from uni4d_fg.config.base import Section, setting
 
+NEAR_DAMPING = 1e-8
+"""First damping of a solve that starts near its minimum: more holds focal lengths, along which the energy is nearly
+flat, and the solve ends before they have moved."""
+
 
 class SolverConfig(Section):
     """Options of one solve."""

@@ -188,7 +188,11 @@ class BundleAdjustmentConfig(Section):
         "the depth prior at its measured sigma; 'relift': mean lift of the depth cue (the reference's choice); "
         "'keep': as they are.",
     )
-    solver: SolverConfig = setting(SolverConfig(max_iterations=30, relative_decrease=1e-3), "Solver.", basic=True)
+    solver: SolverConfig = setting(
+        SolverConfig(max_iterations=30, relative_decrease=1e-3),
+        "Solver; of two solves, the second starts with a damping of 1e-8 at most, as it is near its minimum.",
+        basic=True,
+    )
     structure_solver: SolverConfig = setting(
         SolverConfig(max_iterations=40, relative_decrease=1e-6, early_relative_decrease=1e-4, landmark_steps=12),
         "Solver of 'refine': nothing couples the landmarks but the scales.",

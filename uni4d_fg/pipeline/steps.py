@@ -28,7 +28,7 @@ from uni4d_fg.pipeline.inertial import imu_fact, imu_summary
 from uni4d_fg.pipeline.rigid import rigid_objects_part
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
-from uni4d_fg.pipeline.warnings import open_focal_warnings, scene_warnings, unmasked_motion_warnings
+from uni4d_fg.pipeline.warnings import scene_warnings, unmasked_motion_warnings
 from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.depth_spread import depth_spread
@@ -208,12 +208,8 @@ def bundle_summary(
     ]
     warnings = scene_warnings(
         sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
-        arrays["intrinsics_covariance"],
+        arrays["intrinsics_covariance"], focal_was_doubted=sequence.focal_sigma is not None,
     )  # fmt: skip
-    if sequence.focal_sigma is None:  # of focal lengths from motion alone it was said where they were found
-        warnings += open_focal_warnings(
-            arrays["intrinsics"], arrays["intrinsics_covariance"], arrays["world_T_cam"], landmarks
-        )
     warnings += unmasked_motion_warnings(
         labelled, arrays["landmark_track"], arrays["landmark_error"], float(pixel), max(sequence.image_size)
     )

@@ -27,7 +27,7 @@ from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
-from uni4d_fg.pipeline.warnings import open_focal_warnings, scene_warnings
+from uni4d_fg.pipeline.warnings import scene_warnings
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
@@ -199,10 +199,6 @@ def _stream(
     doubts = scene_warnings(
         sequence.intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
         intrinsics_covariance=reconstruction.intrinsics_covariance,
-    )  # fmt: skip
-    doubts += open_focal_warnings(
-        reconstruction.intrinsics, reconstruction.intrinsics_covariance, reconstruction.world_T_cam,
-        reconstruction.landmarks,
     )  # fmt: skip
     facts = []
     if closing is not None:

@@ -80,6 +80,8 @@ def scene_warnings(
     landmarks: FloatArray,
     pose_covariance: FloatArray | None = None,
     intrinsics_covariance: FloatArray | None = None,
+    *,
+    focal_was_doubted: bool = False,
 ) -> list[str]:
     """Return one sentence for everything that makes a static scene doubtful.
 
@@ -90,19 +92,23 @@ def scene_warnings(
         landmarks: (N, 3) world, meters.
         pose_covariance: (T, 6, 6) of the poses' twists, translation last; NaN where it is not known.
         intrinsics_covariance: (4, 4) of ``intrinsics``, px^2; zero where they were held, NaN where it is not known.
+        focal_was_doubted: How well the focal lengths are known was said where they were found.
     """
     warnings = focal_warnings(given_intrinsics, intrinsics[:2])
     if not len(landmarks):
         return [*warnings, "there are no landmarks: the cameras rest on nothing that was measured"]
-    baseline, depth = _extent(world_T_cam, landmarks)
-    if hardly_moves(world_T_cam, landmarks):
+    first = world_T_cam[0, :3, 3]
+    baseline = float(np.linalg.norm(world_T_cam[:, :3, 3] - first, axis=1).max())
+    depth = float(np.median(np.linalg.norm(landmarks - first, axis=1)))
+    focal_sigma = _focal_sigma(intrinsics_covariance, intrinsics)
+    if baseline < _MIN_BASELINE * depth:
         text = f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
         text += "depth comes from the cue alone"
         # A camera that turns on the spot determines its focal length; one that is held needs no determining.
-        if intrinsics_covariance is None or not _determine_focal(intrinsics_covariance, intrinsics):
+        if not focal_sigma <= _MAX_FOCAL_SIGMA:
             text += ", and the focal length is poorly determined"
-        warnings.append(text)
-    elif pose_covariance is not None and len(world_T_cam) > 1:
+        return [*warnings, text]
+    if pose_covariance is not None and len(world_T_cam) > 1:
         path = float(np.linalg.norm(np.diff(world_T_cam[:, :3, 3], axis=0), axis=1).sum())
         variance = np.einsum("nii->n", pose_covariance[1:, 3:, 3:])
         uncertainty = float(np.sqrt(np.maximum(variance, 0.0).mean())) / path
@@ -111,20 +117,12 @@ def scene_warnings(
                 f"camera positions are uncertain by {100 * uncertainty:.0f} % of the path's length: too little that is "
                 "static is seen well; look at masks, tracks and the share of the image that moves"
             )
-    return warnings
+    return warnings if focal_was_doubted else warnings + _open_focal(intrinsics, focal_sigma)
 
 
-def open_focal_warnings(
-    intrinsics: FloatArray, intrinsics_covariance: FloatArray | None, world_T_cam: FloatArray, landmarks: FloatArray
-) -> list[str]:
-    """Return a sentence if focal lengths that were solved for are known badly though the camera moves.
-
-    A camera that hardly moves is warned of by :func:`scene_warnings`. The arguments are as there.
-    """
-    if intrinsics_covariance is None or hardly_moves(world_T_cam, landmarks):
-        return []
-    sigma = float((np.sqrt(np.diagonal(intrinsics_covariance)[:2]) / intrinsics[:2]).max())
-    if not sigma > _MAX_FOCAL_SIGMA:  # nor where it is not known
+def _open_focal(intrinsics: FloatArray, sigma: float) -> list[str]:
+    """Return a sentence if focal lengths that were solved for are known badly; none where it is not known how well."""
+    if not sigma > _MAX_FOCAL_SIGMA:
         return []
     return [
         f"this video leaves the focal length open: {intrinsics[:2].mean():.0f} px was found, give or take "
@@ -133,20 +131,6 @@ def open_focal_warnings(
     ]
 
 
-def hardly_moves(world_T_cam: FloatArray, landmarks: FloatArray) -> bool:
-    """Return whether poses (T, 4, 4) lie within a small part of the distance to landmarks (N, 3); so without any."""
-    baseline, depth = _extent(world_T_cam, landmarks)
-    return not baseline >= _MIN_BASELINE * depth
-
-
-def _extent(world_T_cam: FloatArray, landmarks: FloatArray) -> tuple[float, float]:
-    """Return the largest distance from the first camera to another, and the median one to the landmarks (or inf)."""
-    first = world_T_cam[0, :3, 3]
-    baseline = float(np.linalg.norm(world_T_cam[:, :3, 3] - first, axis=1).max())
-    depth = float(np.median(np.linalg.norm(landmarks - first, axis=1))) if len(landmarks) else np.inf
-    return baseline, depth
-
-
-def _determine_focal(covariance: FloatArray, intrinsics: FloatArray) -> bool:
-    """Return whether a covariance (4, 4), px^2, leaves the focal lengths little room; not where it is not known."""
-    return bool((np.sqrt(np.diagonal(covariance)[:2]) <= _MAX_FOCAL_SIGMA * intrinsics[:2]).all())
+def _focal_sigma(covariance: FloatArray | None, intrinsics: FloatArray) -> float:
+    """Return the standard deviation of the focal lengths, as a part of them, from a covariance (4, 4), px^2, or NaN."""
+    return np.nan if covariance is None else float((np.sqrt(np.diagonal(covariance)[:2]) / intrinsics[:2]).max())

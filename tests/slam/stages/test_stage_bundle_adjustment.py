@@ -67,6 +67,23 @@ def adjust(
     return adjust_bundle(observations, cameras, intrinsics, config, Freedom(poses_free, intrinsics_free), energy, hooks)
 
 
+def past_a_scene(turn: float) -> np.ndarray:
+    """Poses (T, 4, 4) of a camera that goes past a scene and turns with it by so many rad in all."""
+    part = np.linspace(0.0, 1.0, FRAMES)
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, 0, 3] = 0.3 * part
+    poses[:, :3, :3] = se3.so3_exp(np.outer(part, [0.0, -turn, 0.0]))
+    return poses
+
+
+def drifting(rng: np.random.Generator, poses: np.ndarray, drift_px: float) -> Observations:
+    """Observations of 150 points: noise of 0.2 px, and tracks that have drifted by so much at the end."""
+    part = np.linspace(0.0, 1.0, len(poses))
+    drift = rng.normal(scale=drift_px, size=(150, 1, 2)) * part[:, None]
+    off = drift + rng.normal(scale=0.2, size=(150, len(poses), 2))
+    return static_observations(shift(observe(static_points(rng, 150), poses), off.astype(np.float32)))
+
+
 def test_exact_observations_give_the_exact_scene(exact: LabelledTracks, start: np.ndarray) -> None:
     result = adjust(static_observations(exact), start)
     np.testing.assert_allclose(result.cameras.world_T_cam, POSES, atol=1e-4)
@@ -186,16 +203,11 @@ def test_a_sound_cue_is_believed_where_tracks_that_drift_tell_another_focal_leng
 
     Cameras of a loose start depart from the cue by what the tracks are off, which then counts as noise of the cue.
     """
-    rng, part = np.random.default_rng(0), np.linspace(0.0, 1.0, FRAMES)
-    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    poses[:, 0, 3] = 0.3 * part
-    poses[:, :3, :3] = se3.so3_exp(np.outer(part, [0.0, -0.1, 0.0]))
+    rng, poses = np.random.default_rng(0), past_a_scene(turn=0.1)
     guess = K * np.array([1.1, 1.1, 1.0, 1.0])
     error: dict[float | None, list[float]] = {0.07: [], None: []}
     for _ in range(6):
-        drift = rng.normal(scale=1.0, size=(150, 1, 2)) * part[:, None]
-        off = drift + rng.normal(scale=0.2, size=(150, FRAMES, 2))
-        seen = static_observations(shift(observe(static_points(rng, 150), poses), off.astype(np.float32)))
+        seen = drifting(rng, poses, drift_px=1.0)
         for sigma, errors in error.items():
             settings = changed(first_depth_sigma=sigma, focal_prior_fraction=0.5)
             found = adjust(seen, poses, settings, intrinsics=guess, intrinsics_free=True)
@@ -207,12 +219,8 @@ def test_a_sound_cue_is_believed_where_tracks_that_drift_tell_another_focal_leng
 @pytest.mark.parametrize("seed", range(3))
 def test_the_last_solve_ends_where_the_focal_length_has_its_minimum(seed: int) -> None:
     """A camera that goes past a scene: the energy is nearly flat along the focal length, which damping would hold."""
-    rng, part = np.random.default_rng(seed), np.linspace(0.0, 1.0, FRAMES)
-    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    poses[:, 0, 3] = 0.3 * part
-    poses[:, :3, :3] = se3.so3_exp(np.outer(part, [0.0, -0.02, 0.0]))
-    off = rng.normal(scale=0.3, size=(150, 1, 2)) * part[:, None] + rng.normal(scale=0.2, size=(150, FRAMES, 2))
-    seen = static_observations(shift(observe(static_points(rng, 150), poses), off.astype(np.float32)))
+    poses = past_a_scene(turn=0.02)
+    seen = drifting(np.random.default_rng(seed), poses, drift_px=0.3)
     ends: list[tuple[float, float]] = []
 
     def run(stage: Stage, state: State, hooks: Hooks | None = None) -> tuple[State, SolveSummary]:

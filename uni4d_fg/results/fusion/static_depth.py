@@ -327,10 +327,9 @@ def trust_in_cue(log_cue: Float32Array, measured: Measured, known: Known) -> tup
     left = np.where(usable, np.abs(known.depth.log_depth - log_cue), np.float32(0))
     if not usable.any():
         return np.full_like(log_cue, 0.05), np.full_like(log_cue, _USUALLY_RIGHT)
-    if known.reliability < _JUDGES:
-        usual = robust_sigma(left[usable])
-        return np.full_like(log_cue, max(usual, _LEAST_SIGMA)), np.full_like(log_cue, _USUALLY_RIGHT)
     usual = robust_sigma(left[usable])
+    if known.reliability < _JUDGES:
+        return np.full_like(log_cue, max(usual, _LEAST_SIGMA)), np.full_like(log_cue, _USUALLY_RIGHT)
     wrong = usable & (left > 4.0 * usual + 0.02)
     near = cv2.GaussianBlur(np.dstack((usable, wrong)).astype(np.float32), (0, 0), _NEARBY_PX)
     count, failures = near[..., 0], near[..., 1]

@@ -16,7 +16,7 @@ import numpy as np
 
 from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import FloatArray
-from uni4d_fg.config.solver import KernelConfig, SolverConfig
+from uni4d_fg.config.solver import NEAR_DAMPING, KernelConfig, SolverConfig
 from uni4d_fg.config.stages import AccelerationConfig, BundleAdjustmentConfig, CameraMotionConfig
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.factors.batch import FactorBatch
@@ -48,9 +48,6 @@ from uni4d_fg.slam.stages.structure import (
 )
 from uni4d_fg.slam.stages.terms import camera_motion_terms, intrinsics_priors
 
-_NEAR_DAMPING = 1e-8
-"""First damping of a solve that starts near its minimum: more holds focal lengths, along which the energy is nearly
-flat, and the solve ends before they have moved."""
 _FIRST_DEPTH_KERNEL = KernelConfig(kind="cauchy", threshold=1.0)
 """Of the first solve: a track beside an edge moves with what is in front and may have the depth behind, and among small
 things half of all do. A kernel that holds on to them bends the cameras."""
@@ -252,7 +249,7 @@ def adjust_bundle(
 
 def near_the_minimum(solver: SolverConfig) -> SolverConfig:
     """Return the options of a solve that starts near its minimum."""
-    return solver.model_copy(update={"initial_damping": min(solver.initial_damping, _NEAR_DAMPING)})
+    return solver.model_copy(update={"initial_damping": min(solver.initial_damping, NEAR_DAMPING)})
 
 
 def held_to_the_cue(noise: StaticNoise, config: BundleAdjustmentConfig) -> tuple[StaticNoise, BundleAdjustmentConfig]:
