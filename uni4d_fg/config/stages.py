@@ -128,6 +128,12 @@ class BundleAdjustmentConfig(Section):
         "weigh by what they say; null: all frames weigh alike.",
         gt=1,
     )
+    track_noise_dof: float | None = setting(
+        6.0,
+        "Each track has a variance of its own after the first solve, from its residuals, which count for two degrees "
+        "of freedom, and from a prior with this many; null: all tracks alike.",
+        gt=0,
+    )
     min_reprojection_sigma_px: float = setting(0.1, "Floor of the measured reprojection sigma, px.", gt=0)
     min_depth_sigma: float = setting(0.002, "Floor of the measured depth sigma.", gt=0)
     reprojection_kernel: KernelConfig = setting(KernelConfig(kind="huber", threshold=0.7), "Kernel of E_BA.")

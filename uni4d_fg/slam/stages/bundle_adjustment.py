@@ -1,10 +1,10 @@
 """Stage 2: bundle adjustment of poses, intrinsics, depth scales and landmarks.
 
 Landmarks start at the mean lift of their depth cues. With the MAP energy a first solve uses the configured
-sigmas and believes the depth cue more closely; observations that disagree are dropped, the noise of reprojection and of
-depth is measured on what stays, and a second solve uses it; in that one, tracks that are fragments of one point share a
-landmark. Frame 0's pose is the gauge; the depth prior (or, without it, the distance of the two farthest cameras) holds
-the scale.
+sigmas and believes the depth cue more closely; observations that disagree are dropped, the noise of reprojection (of
+each track) and of depth is measured on what stays, and a second solve uses it; in that one, tracks that are fragments
+of one point share a landmark. Frame 0's pose is the gauge; the depth prior (or, without it, the distance of the two
+farthest cameras) holds the scale.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.acceleration import AccelerationPrior, estimate_prior, starting_prior
 from uni4d_fg.slam.stages.energy import MAP, Energy
-from uni4d_fg.slam.stages.frame_noise import weigh_by_frame
 from uni4d_fg.slam.stages.merging import FindFragments, MergedTracks, merge_tracks
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
@@ -47,6 +46,7 @@ from uni4d_fg.slam.stages.structure import (
     reprojection_term,
 )
 from uni4d_fg.slam.stages.terms import camera_motion_terms, intrinsics_priors
+from uni4d_fg.slam.stages.weights import weigh_by_residuals
 
 _FIRST_DEPTH_KERNEL = KernelConfig(kind="cauchy", threshold=1.0)
 """Of the first solve: a track beside an edge moves with what is in front and may have the depth behind, and among small
@@ -216,7 +216,7 @@ def adjust_bundle(
             )
         noise = measure_noise(state, observations, noise, config)
         if index < rounds - 1:
-            observations = weigh_by_frame(state, observations, len(state[POSE]), config)
+            observations = weigh_by_residuals(state, observations, config)
         if find_fragments is not None and index < rounds - 1:
             state, observations, merged = merge_tracks(state, observations, find_fragments(state, observations, noise))
     if config.structure == "refine" and energy.is_likelihood and solves[-1].termination is not Termination.CANCELLED:

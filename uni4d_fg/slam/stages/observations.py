@@ -24,7 +24,7 @@ class Observations:
     depth: FloatArray
     """(N,) depth cue, m; NaN where missing."""
     weight: FloatArray
-    """(N,) in (0, 1]."""
+    """(N,) above 0: the inverse of the variance, relative to an observation in a track's query frame."""
 
     def __len__(self) -> int:
         return len(self.track)
