@@ -19,7 +19,7 @@ odometry = [
 
 def join(stage, state):
     """Add the odometry to bundle adjustment."""
-    return fg.Addition(odometry) if stage.kind == "bundle_adjustment" else None
+    return fg.Addition(odometry) if stage.finds_cameras else None
 
 
 with tempfile.TemporaryDirectory() as folder:

@@ -354,6 +354,8 @@ def broken_parts(scene: Sequence) -> dict[str, tuple[dict[str, object], str]]:
         "NaN intrinsics": ({"intrinsics": np.full(4, np.nan)}, "positive focal lengths"),
         "time stands still": ({"timestamps": 0.0 * times}, "strictly increasing"),
         "too few times": ({"timestamps": times[:4]}, "one strictly increasing number of seconds per frame"),
+        "short zoom": ({"zoom": np.ones(3)}, "zoom that is not 8 numbers above 0 and at most 1"),
+        "lost zoom": ({"zoom": np.full(FRAMES, np.nan)}, "zoom that is not 8 numbers above 0 and at most 1"),
         "too few depth maps": ({"depths": ArrayFrames(depth_of(scene)[:5])}, "has 5 depth maps, but there are 8"),
         "too few masks": ({"masks": ArrayFrames(masks_of(scene)[:5])}, "has 5 masks, but there are 8 images"),
         "small images": ({"images": ArrayFrames(gray)}, r"image of frame 0 has shape \(90, 128, 3\)"),

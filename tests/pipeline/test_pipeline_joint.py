@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from pipeline_scenes import SMALL, arrays_of, make_config, make_scene, masks_of, resumed_stages, run_sound, with_masks
 
+from uni4d_fg.config.solver import NativeKernelConfig
+from uni4d_fg.frontend.measurements.relative_poses import RelativePoses
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS
 from uni4d_fg.results.graph_summary import stage_graphs
 from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.measurements.relative_poses import RelativePoseSource
 
 pytest.importorskip("open3d")
 
@@ -54,6 +57,21 @@ def test_a_run_with_the_joint_energy_is_sound_and_can_be_switched_back(sequence:
     assert not list(folder.graphs.glob("joint*"))
     for name, array in arrays_of(folder.reconstruction).items():
         np.testing.assert_array_equal(array, before[name], err_msg=name)
+
+
+def test_measured_poses_hold_the_cameras_of_the_joint_solve_too(sequence: Sequence, tmp_path: Path) -> None:
+    last = sequence.num_frames - 1
+    assert sequence.ground_truth is not None
+    known = np.linalg.inv(sequence.ground_truth.world_T_cam[0]) @ sequence.ground_truth.world_T_cam[last]
+    tight = np.eye(6)[None] * 1e8
+    source = RelativePoseSource(
+        RelativePoses(np.array([0]), np.array([last]), known[None], tight), NativeKernelConfig(kind="quadratic")
+    )
+    for changes in ((), (JOINT,)):
+        folder = RunFolder(tmp_path / f"run{len(changes)}")
+        reconstruct(sequence, folder.root, make_config(*changes), additions=[source])
+        poses = arrays_of(folder.reconstruction)["world_T_cam"]
+        np.testing.assert_allclose(np.linalg.inv(poses[0]) @ poses[last], known, atol=1e-3)
 
 
 def test_without_moving_points_there_is_nothing_to_do(sequence: Sequence, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from stream_samples import stream, stream_config
 
-from uni4d_fg.errors import Cancelled, InputError
+from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
-from uni4d_fg.pipeline.stream import stream_sequence
+from uni4d_fg.pipeline.stream import not_in_streams, stream_sequence
 from uni4d_fg.pipeline.warnings import scene_warnings
 
 FRAMES, TAKEN = 10, 6
@@ -131,3 +131,16 @@ def test_a_stream_without_static_tracks_says_so(tmp_path: Path) -> None:
     summary = stream_sequence(moving, tmp_path, CONFIG)
     assert any("no landmarks" in text for text in summary.warnings())
     assert any("no landmarks" in text for text in summary.to_dict()["warnings"])
+
+
+@pytest.mark.parametrize("setting", ["camera.zoom=on", "input.poses=fixed"])
+def test_what_a_stream_cannot_do_is_refused(tmp_path: Path, setting: str) -> None:
+    with pytest.raises(ConfigError, match=setting.split("=")[0]):
+        stream_sequence(scene(), tmp_path / "run", stream_config(setting))
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_a_stream_leaves_out_is_said() -> None:
+    assert not_in_streams(CONFIG) == []
+    (said,) = not_in_streams(stream_config("joint.enabled=true", "windows.frames=8", "input.poses=initial"))
+    assert "leaves out input.poses, joint.enabled, windows.frames;" in said

@@ -83,10 +83,8 @@ def reconstruct(
     from uni4d_fg.cues.intermediate import drop_intermediate
     from uni4d_fg.frontend.measurements.imu import read_imu
     from uni4d_fg.pipeline.asked import check_asked
-    from uni4d_fg.pipeline.inertial import check_goes_with_imu
     from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
     from uni4d_fg.pipeline.workers.options import WorkerOptions
-    from uni4d_fg.slam.windows.plan import windows_of
 
     began = time.perf_counter()
     chosen = [] if solver is None else [f"solver={solver.value}"]
@@ -108,12 +106,9 @@ def reconstruct(
     run = out or Path("runs") / (seq.stem if seq.is_file() else Path(source.root).name)
     samples = None if imu is None else read_imu(imu)
     opened = source.open()
-    if samples is not None:
-        check_goes_with_imu(settings, len(windows_of(settings, opened.video.num_frames)))
-        samples.check_covers(opened.video.timestamps)
     plan = source.plan(opened)
     plan.check()
-    check_asked(opened.video, settings)
+    check_asked(opened.video, settings, samples)
     files = MeasurementFiles(odometry, gps, relative_poses)
     is_measured = any(given is not None for given in (imu, odometry, gps, relative_poses))
     # What is wrong with a file is said before anything is made.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from uni4d_fg.config.base import Section, setting
-from uni4d_fg.config.solver import KernelConfig
+from uni4d_fg.config.solver import NativeKernelConfig
 
 
 class LoopsConfig(Section):
@@ -49,8 +49,8 @@ class LoopsConfig(Section):
         "by more than this part of the turns, is taken for a place that only looks alike.",
         gt=0,
     )
-    kernel: KernelConfig = setting(
-        KernelConfig(kind="cauchy", threshold=2.4), "Robust kernel of a closure: 'quadratic', 'huber' or 'cauchy'."
+    kernel: NativeKernelConfig = setting(
+        NativeKernelConfig(kind="cauchy", threshold=2.4), "Robust kernel of a closure."
     )
     let_go: float = setting(
         10.0,

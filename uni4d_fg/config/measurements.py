@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from uni4d_fg.config.base import Section, setting
-from uni4d_fg.config.solver import KernelConfig
+from uni4d_fg.config.solver import KernelConfig, NativeKernelConfig
 
 Vector3 = tuple[float, float, float]
 Pose7 = tuple[float, float, float, float, float, float, float]
@@ -41,6 +41,6 @@ class MeasurementsConfig(Section):
         "they do not say how the map lies.",
         ge=0,
     )
-    relative_poses_kernel: KernelConfig = setting(
-        KernelConfig(kind="huber", threshold=3.0), "Robust kernel of relative poses: a loop closure may be wrong."
+    relative_poses_kernel: NativeKernelConfig = setting(
+        NativeKernelConfig(kind="huber", threshold=3.0), "Robust kernel of relative poses: a loop closure may be wrong."
     )

@@ -65,3 +65,11 @@ class KernelConfig(Section):
     threshold: float = setting(
         1.345, "Threshold in whitened units (for 'norm': smoothing in the residual's unit).", gt=0
     )
+
+
+class NativeKernelConfig(KernelConfig):
+    """A robust kernel that GTSAM's own factors take."""
+
+    kind: Literal["quadratic", "huber", "cauchy"] = setting(
+        "huber", "rho(s): 'quadratic' s^2/2; 'huber' and 'cauchy' with threshold."
+    )

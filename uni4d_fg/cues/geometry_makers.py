@@ -24,6 +24,7 @@ from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import MaskFolder
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.optim.runners import solver_settings
 from uni4d_fg.progress import Reporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 
@@ -128,9 +129,9 @@ def moving_masks(
         Cancelled: If ``should_stop`` turned true.
     """
     key = maker_key(
-        config.motion_masks, config.camera_init, config.bundle_adjustment, config.labels, config.input, images_key,
-        depth_key, _tracks_key(tracks), camera.intrinsics.tolist(), _camera_key(camera),
-        "" if moving is None else _digest(moving),
+        config.motion_masks, config.camera_init, config.bundle_adjustment, config.geometric_depth, config.labels,
+        config.input, *solver_settings(config), images_key, depth_key, _tracks_key(tracks), camera.intrinsics.tolist(),
+        _camera_key(camera), "" if moving is None else _digest(moving),
     )  # fmt: skip
     target = folder / "masks" / f"motion-{key}"
     cache = FrameCache(target)

@@ -1,7 +1,7 @@
 """A user's own factors and variables in any stage, whatever solves it.
 
     def gps(stage, state):
-        if stage.kind != "bundle_adjustment":
+        if not stage.finds_cameras:
             return None
         return Addition([position_prior(frames, xyz=measured, sigma=0.05)])
 

@@ -75,6 +75,11 @@ class Stage:
         return f"{self.kind}[{self.part}]" if self.part else self.kind
 
     @property
+    def finds_cameras(self) -> bool:
+        """Whether it is bundle adjustment, alone or in the joint energy: where measurements of the cameras join."""
+        return self.kind in ("bundle_adjustment", "joint")
+
+    @property
     def reads_free_variables(self) -> bool:
         """Whether any factor reads a variable that may move."""
         problem = self.problem

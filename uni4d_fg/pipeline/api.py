@@ -17,11 +17,13 @@ from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.shots.cuts import find_cuts
 from uni4d_fg.optim.added_factors import FactorSource
-from uni4d_fg.pipeline.measurements import MeasurementFiles
+from uni4d_fg.pipeline.asked import check_asked
+from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.run import reconstruct as reconstruct_sequence
 from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import Reconstruction
 
@@ -77,6 +79,9 @@ def reconstruct(
     else:
         path = Path(source)
         video = open_video(path)
+        # What is wrong is said before anything is made.
+        check_asked(video, settings, samples, workers)
+        read_measurements(measurements or MeasurementFiles(), video.timestamps, settings.measurements)
         if settings.shots.split == "auto" and samples is None and measurements is None:
             frames = ", ".join(str(cut.frame) for cut in find_cuts(video.images, settings.shots))
             warnings = [_CUTS.format(frames=frames)] if frames else []
@@ -85,9 +90,11 @@ def reconstruct(
             sequence = as_sequence(replace(video, masks=None) if plan.masks == "none" else video)
         else:
             plan.check()
-            sequence, report = gather_cues(
-                video, plan, folder / "cues", settings, reporter=reporter, track_cache=folder / "stages"
-            )
+            with run_lock(folder):
+                mark_run(folder)
+                sequence, report = gather_cues(
+                    video, plan, folder / "cues", settings, reporter=reporter, track_cache=folder / "stages"
+                )
     cues = None if report is None else report.to_dict()
     settings = settings_for_depth(settings, sequence)
     reconstruct_sequence(

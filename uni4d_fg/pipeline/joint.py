@@ -24,9 +24,11 @@ from uni4d_fg.slam.stages.energy import energy_of
 from uni4d_fg.slam.stages.joint import MovingCues, solve_joint
 from uni4d_fg.slam.stages.observations import Observations, observations_of, weigh_by_drift
 from uni4d_fg.slam.stages.scene import DynamicScene, StaticScene, unknown_covariances
+from uni4d_fg.slam.stages.weights import weigh_by_residuals
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 NOT_IN_WINDOWS = "the joint energy is not solved in windows"
+WITHOUT_IMU = "the joint energy has no part for inertial measurements: its cameras are those of the images alone"
 
 
 def joint_step(
@@ -78,12 +80,17 @@ def joint_step(
 
 
 def static_scene(labelled: LabelledTracks, scene: Arrays, config: Config) -> StaticScene:
-    """Return the end of stage 2 from its record, with all observations of the landmarks it kept."""
+    """Return the end of stage 2 from its record, with all observations of the landmarks it kept.
+
+    Tracks of one point, which were one landmark in stage 2, are a landmark each.
+    """
     observations, _ = landmark_observations(labelled, scene)
+    cameras, noise = frozen_cameras(scene)
     if energy_of(config).is_likelihood:
         drift = config.bundle_adjustment.drift_frames
         observations = weigh_by_drift(observations, labelled.tracks.query_frame, drift)
-    cameras, noise = frozen_cameras(scene)
+        state = cameras.state(scene["landmarks"], scene["landmark_track"])
+        observations = weigh_by_residuals(state, observations, config.bundle_adjustment)
     unknown = unknown_covariances(len(cameras.world_T_cam))
     return StaticScene(
         cameras, scene["landmarks"], scene["landmark_track"], observations, noise, scene["landmark_error"],

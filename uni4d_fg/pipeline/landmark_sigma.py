@@ -40,7 +40,7 @@ def landmark_shares(labelled: LabelledTracks, scene: Arrays, intrinsics: FloatAr
         by_x, _ = projection_derivatives(np.broadcast_to(intrinsics[frame], (len(x), 4)), x)
         jacobian = chain_to_world_point(by_x, np.broadcast_to(pose, (len(x), 4, 4)))
         information[seen] += np.swapaxes(jacobian, 1, 2) @ jacobian
-    noise_px, noise_depth = (float(value) for value in scene["noise"])
+    noise_px, noise_depth = scene["noise"][:2].tolist()
     first = np.argmax(weight, axis=1)
     away = points - poses[first, :3, 3]
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)

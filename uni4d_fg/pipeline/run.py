@@ -24,7 +24,7 @@ from uni4d_fg.cues.depth_settings import settings_of_judgment
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
 from uni4d_fg.cues.plan import CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
-from uni4d_fg.errors import ConfigError, InputError
+from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_write_json, atomic_write_text
 from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.bars import bars_note, without_bars
@@ -50,8 +50,8 @@ from uni4d_fg.pipeline.first_cameras import StageInputs, first_cameras
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import KEPT, GraphValues
 from uni4d_fg.pipeline.in_progress import MUCH, RunInProgress
-from uni4d_fg.pipeline.inertial import check_goes_with_imu, metric_cues
-from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, joint_step
+from uni4d_fg.pipeline.inertial import metric_cues
+from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, WITHOUT_IMU, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
 from uni4d_fg.pipeline.lens import found_camera, goes_along, is_sought, known_camera, lens_step
 from uni4d_fg.pipeline.loops import loop_closing, with_loops
@@ -128,12 +128,7 @@ def reconstruct(
         Cancelled: If ``should_stop`` turned true.
     """
     check_sequence(sequence)
-    if imu is not None:
-        check_goes_with_imu(config, len(windows_of(config, sequence.num_frames)))
-        imu.check_covers(sequence.timestamps)
-    check_asked(sequence, config)
-    if workers is not None and config.windows.frames is None:
-        raise ConfigError("workers solve the windows of a long video: set windows.frames (`--window N`)")
+    check_asked(sequence, config, imu, workers)
     recorder = RecordingRunner(stage_runner(config), KEPT)
     # Threads of BLAS wait for each other in busy loops: on a busy machine small matrices take a thousand times as long.
     # What is worth several threads divides its work itself.
@@ -335,6 +330,8 @@ def _stages(
     if not config.joint.enabled:
         run.forget("joint")
         return key, scene, motion
+    if run.imu is not None:
+        run.summary.warnings.append(WITHOUT_IMU)
     key = stage_key(key, config.joint)
     both = run.step("joint", key, lambda hooks: joint_step(sequence, labelled, scene, motion, config, hooks, run_stage))
     return key, both, both

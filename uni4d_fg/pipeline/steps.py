@@ -143,7 +143,7 @@ def _with_imu(
     stop_if_cancelled(first.solves)
     adding = adding_to(run, [first.source])
     solver = StaticSceneSolver(config, adding, hooks, find_fragments=find_fragments, timestamps=sequence.timestamps)
-    scene = solver.adjust(labelled, first.cameras, prior, freedom)
+    scene = solver.adjust(labelled, first.cameras, prior, freedom, sequence.focal_sigma)
     stop_if_cancelled(scene.solves)
     summary = _scene_summary(sequence, labelled, replace(scene, solves=[*first.solves, *scene.solves]), config)
     summary["imu"] = imu_summary(first, adding)
@@ -162,7 +162,7 @@ def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
         "landmark_error": scene.landmark_error,
         "pose_covariance": scene.pose_covariance,
         "intrinsics_covariance": scene.intrinsics_covariance,
-        "noise": np.array([scene.noise.reprojection_sigma_px, scene.noise.depth_sigma]),
+        "noise": scene.noise.array(),
         **({} if scene.acceleration is None else scene.acceleration.arrays()),
     }
 
@@ -201,17 +201,22 @@ def bundle_summary(
 ) -> dict[str, Any]:
     """Return what ``summary.json`` says of stage 2, from its record's arrays."""
     (fx, fy), landmarks = arrays["intrinsics"][:2], arrays["landmarks"]
-    pixel, relative = arrays["noise"]
+    noise = StaticNoise.of_array(arrays["noise"])
     facts = [
         f"{len(landmarks)} landmarks, {num_observations} observations, "
-        f"fx {fx:.1f} fy {fy:.1f} px, noise {pixel:.2f} px, depth {100 * relative:.1f} %"
+        f"fx {fx:.1f} fy {fy:.1f} px, noise {noise.reprojection_sigma_px:.2f} px, "
+        f"depth {100 * noise.depth_sigma:.1f} %"
     ]
     warnings = scene_warnings(
         sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
         arrays["intrinsics_covariance"], focal_was_doubted=sequence.focal_sigma is not None,
     )  # fmt: skip
     warnings += unmasked_motion_warnings(
-        labelled, arrays["landmark_track"], arrays["landmark_error"], float(pixel), max(sequence.image_size)
+        labelled,
+        arrays["landmark_track"],
+        arrays["landmark_error"],
+        noise.reprojection_sigma_px,
+        max(sequence.image_size),
     )
     return {"solves": solves, "dropped": dropped, "facts": facts, "warnings": warnings}
 
@@ -226,7 +231,7 @@ def _without_landmarks(cameras: Arrays, config: Config, reason: str) -> StageRec
         "landmarks": np.zeros((0, 3)),
         "landmark_track": np.zeros(0, dtype=np.int64),
         "landmark_error": np.zeros(0, dtype=np.float32),
-        "noise": np.array([stage.reprojection_sigma_px, stage.depth_sigma]),
+        "noise": StaticNoise(stage.reprojection_sigma_px, stage.depth_sigma).array(),
     }
     warning = f"cameras kept as given, depth scales not estimated, noise not measured ({reason})"
     return StageRecord(arrays, {"solves": [], "warnings": [warning]})
@@ -343,9 +348,8 @@ def landmark_observations(labelled: LabelledTracks, scene: Arrays) -> tuple[Obse
 
 def frozen_cameras(scene: Arrays) -> tuple[Cameras, StaticNoise]:
     """Return what stage 3 takes from a stage 2 record."""
-    pixel, relative = scene["noise"].tolist()
     log_scale: FloatArray = scene["log_scale"]
-    return Cameras(scene["world_T_cam"], scene["intrinsics"], log_scale), StaticNoise(pixel, relative)
+    return Cameras(scene["world_T_cam"], scene["intrinsics"], log_scale), StaticNoise.of_array(scene["noise"])
 
 
 def stop_if_cancelled(solves: list[SolveSummary], message: str = STOPPED) -> None:

@@ -102,7 +102,25 @@ def check_stream(sequence: Sequence, config: Config) -> None:
     check_parameters(sequence, config, "in a stream", "find it with `uni4d-fg reconstruct`")
     if sequence.zoom is not None:
         raise ConfigError("a stream has one focal length, and this camera zooms; use `uni4d-fg reconstruct`")
+    if config.camera.zoom == "on":
+        raise ConfigError("a stream has one focal length: leave camera.zoom 'auto' or 'off'")
+    if config.input.poses == "fixed":
+        raise ConfigError(
+            "a stream finds its cameras itself: leave input.poses 'estimate', or use `uni4d-fg reconstruct`"
+        )
     check_incremental(config)
+
+
+def not_in_streams(config: Config) -> list[str]:
+    """Return a warning of what a configuration asks for and a stream leaves out; empty where there is nothing."""
+    asked = {
+        "input.poses": config.input.poses != "estimate",
+        "joint.enabled": config.joint.enabled,
+        "rigid_objects.enabled": config.rigid_objects.enabled,
+        "windows.frames": config.windows.frames is not None,
+    }
+    left_out = [name for name, is_asked in asked.items() if is_asked]
+    return [f"a stream leaves out {', '.join(left_out)}; `uni4d-fg reconstruct` has it"] if left_out else []
 
 
 def stream_sequence(
@@ -147,6 +165,7 @@ def stream_sequence(
             facts=[*summary.facts, *measured.facts],
             doubts=[
                 *order_warnings(sequence.frame_names),
+                *not_in_streams(config),
                 *([] if sequence.depth_is_metric else [NOT_METRIC_GIVEN]),
                 *summary.doubts,
                 *measured.warnings,

@@ -43,8 +43,7 @@ def state_arrays(solver: IncrementalReconstructor) -> Arrays:
     window, dynamic, tracker = solver.window, solver.dynamic, solver.tracker
     out: Arrays = {f"window_{name}": getattr(window, name) for name in _WINDOW}
     out |= {f"window_observed_{name}": getattr(window.observations, name) for name in _OBSERVATIONS}
-    noise = window.noise
-    out["window_noise"] = np.array([noise.reprojection_sigma_px, noise.depth_sigma, noise.depth_correlation])
+    out["window_noise"] = window.noise.array()
     out["window_counters"] = np.array([window.slides, int(window.intrinsics_free)])
     out["window_error_px"] = np.array(window.error_px)
     out["window_prior_intrinsics"] = window.prior_intrinsics
@@ -101,7 +100,7 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
     for name in _WINDOW:
         setattr(window, name, arrays[f"window_{name}"])
     window.observations = Observations(*(arrays[f"window_observed_{name}"] for name in _OBSERVATIONS))
-    window.noise = StaticNoise(*arrays["window_noise"].tolist())
+    window.noise = StaticNoise.of_array(arrays["window_noise"])
     slides, free = arrays["window_counters"].tolist()
     window.slides, window.intrinsics_free = int(slides), bool(free)
     window.error_px, window.prior_intrinsics = float(arrays["window_error_px"]), arrays["window_prior_intrinsics"]

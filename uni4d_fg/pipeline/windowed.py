@@ -305,9 +305,7 @@ def _joined_arrays(
     if cue_holds_scale:
         state = hold_metric_scale(state)
     share = np.array([part.count.sum() for part in parts], dtype=np.float64)
-    noise = np.average(
-        [[part.noise.reprojection_sigma_px, part.noise.depth_sigma] for part in parts], axis=0, weights=share
-    )
+    noise = np.average([part.noise.array() for part in parts], axis=0, weights=share)
     pose_covariance, intrinsics_covariance = covariances
     if not np.isfinite(pose_covariance).all():
         pose_covariance, intrinsics_covariance = unknown_covariances(len(cameras.world_T_cam))

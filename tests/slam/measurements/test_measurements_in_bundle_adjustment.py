@@ -15,11 +15,10 @@ from measurement_samples import scale_error, scene, settings, truth
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.measurements import MeasurementsConfig
-from uni4d_fg.config.solver import KernelConfig, SolverConfig
+from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.factors import State
 from uni4d_fg.factors.variable_types import GPS_MAP, LOG_SCALE, POSE
-from uni4d_fg.frontend.measurements.relative_poses import RelativePoses
 from uni4d_fg.geometry import se3
 from uni4d_fg.optim.added_factors import LEFT_OUT, AddingRunner, Addition
 from uni4d_fg.optim.problem import Problem
@@ -28,7 +27,6 @@ from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.results.graph_summary import stage_graphs
 from uni4d_fg.results.io import load_reconstruction
-from uni4d_fg.slam.measurements.relative_poses import RelativePoseSource
 
 Stored = dict[str, dict[str, bool]]
 
@@ -170,10 +168,10 @@ def test_gps_of_a_resting_camera_is_said_to_be_of_no_use(tmp_path: Path) -> None
     assert any("gps.csv is not used" in text for text in measured.warnings)
 
 
-def test_kernels_that_gtsam_does_not_have_are_refused() -> None:
-    edges = RelativePoses(np.array([0]), np.array([1]), np.eye(4)[None], np.eye(6)[None])
-    with pytest.raises(ConfigError, match=r"relative_poses_kernel\.kind=norm"):
-        RelativePoseSource(edges, KernelConfig(kind="norm"))
+@pytest.mark.parametrize("field", ["measurements.relative_poses_kernel.kind", "loops.kernel.kind"])
+def test_kernels_that_gtsam_does_not_have_are_refused(field: str) -> None:
+    with pytest.raises(ConfigError, match=f"{field}: .* one of quadratic, huber, cauchy is expected"):
+        load_config(None, [f"{field}=pseudo_huber"])
 
 
 def test_a_sequence_without_times_says_so(tmp_path: Path) -> None:

@@ -139,3 +139,15 @@ def test_fragments_of_one_point_stay_joined(noisy: LabelledTracks) -> None:
     assert np.linalg.norm(place[first] - WORLD[first]) < 0.05
     assert len(scene.landmark_track) > 0.98 * TRACKS
     assert np.median(errors(scene)) < 0.03
+
+
+@pytest.mark.parametrize("early", [1e-4, None])
+def test_blurred_frames_weigh_less_for_them_however_early_the_first_solve_ends(
+    noisy: LabelledTracks, rng: np.random.Generator, early: float | None
+) -> None:
+    blurred = shift(noisy, rng.normal(scale=3.0, size=(TRACKS, FRAMES, 2)) * (np.arange(FRAMES)[:, None] == 4))
+    scene = adjust(blurred, 1_000, structure_solver={"early_relative_decrease": early})
+    assert scene.solves[-1].name.startswith("further_landmarks")
+    seen = scene.observations  # a quarter of the tracks is in the camera solves, and weighed there as well
+    assert np.mean(seen.weight[seen.frame == 4] < 0.2) > 0.95
+    assert np.mean(seen.weight[seen.frame == 3] > 0.5) > 0.95

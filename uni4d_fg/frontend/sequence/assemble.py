@@ -11,7 +11,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npz
-from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, load_intrinsics
+from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, check_zoom, guess_intrinsics, load_intrinsics
 from uni4d_fg.frontend.sequence.decode import check_bit_depth
 from uni4d_fg.frontend.sequence.frames import DepthFolder, ImageFolder, LazyFrames, MaskFolder, NpyDepth, no_masks
 from uni4d_fg.frontend.sequence.layout import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MASK_SUFFIXES, SequenceFiles, list_frames
@@ -178,11 +178,7 @@ def _noted_camera(note: Any, path: Path, num_frames: int) -> tuple[Lens, FloatAr
             path, f"does not say what the camera is ({error})",
             'write "camera": {"model": "RADIAL", "parameters": [k1, k2], "zoom": null}, or leave it out',
         ) from error  # fmt: skip
-    if zoom is not None and not (zoom.shape == (num_frames,) and (zoom > 0.0).all() and (zoom <= 1.0).all()):
-        raise SequenceProblem(
-            path, f"has a zoom that is not {num_frames} numbers above 0 and at most 1",
-            "write the focal length of each frame over the longest, or null",
-        )  # fmt: skip
+    check_zoom(zoom, num_frames, path)
     return lens, zoom
 
 

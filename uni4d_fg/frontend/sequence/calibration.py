@@ -1,4 +1,4 @@
-"""Camera intrinsics from 3 x 3 matrices."""
+"""Camera intrinsics from 3 x 3 matrices, and what a zoom must be."""
 
 from __future__ import annotations
 
@@ -31,6 +31,19 @@ def intrinsics_matrix(intrinsics: FloatArray) -> FloatArray:
     """Return the (3, 3) matrix of (4,) fx, fy, cx, cy."""
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def check_zoom(zoom: FloatArray | None, num_frames: int, where: Path | str) -> None:
+    """Check the focal length of each frame over the longest, if there is one.
+
+    Raises:
+        SequenceProblem: If it is not one number above 0 and at most 1 per frame.
+    """
+    if zoom is not None and not (zoom.shape == (num_frames,) and (zoom > 0.0).all() and (zoom <= 1.0).all()):
+        raise SequenceProblem(
+            where, f"has a zoom that is not {num_frames} numbers above 0 and at most 1",
+            "write the focal length of each frame over the longest, or null",
+        )  # fmt: skip
 
 
 def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> FloatArray:

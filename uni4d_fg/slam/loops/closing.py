@@ -55,7 +55,7 @@ class LoopClosing:
     def __call__(self, stage: Stage, state: State) -> Addition | None:
         """Search, or judge what was found, and return what holds; None for solves of some of the cameras."""
         everywhere = len(state[POSE]) == self.sequence.num_frames if POSE in state else False
-        if stage.kind != "bundle_adjustment" or stage.own_world or not everywhere:
+        if not stage.finds_cameras or stage.own_world or not everywhere:
             return None
         if self.links is None:
             self.search(state)

@@ -62,7 +62,7 @@ class GpsSource:
 
     def __call__(self, stage: Stage, state: State) -> Addition | None:
         """Join bundle adjustment in the video's world; None elsewhere."""
-        if stage.kind != "bundle_adjustment" or stage.own_world:
+        if not stage.finds_cameras or stage.own_world:
             return None
         known = self.positions
         if not self.is_of_use:

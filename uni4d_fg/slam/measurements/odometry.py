@@ -23,7 +23,7 @@ class OdometrySource:
 
     def __call__(self, stage: Stage, state: State) -> Addition | None:
         """Join bundle adjustment; None elsewhere."""
-        if stage.kind != "bundle_adjustment":
+        if not stage.finds_cameras:
             return None
         _, entry, _ = np.intersect1d(self.odometry.frame, state.numbers(POSE)[:, 0], return_indices=True)
         factors = []

@@ -66,6 +66,15 @@ class StaticNoise:
     overstated: float = 1.0
     """The reprojection sigma as a multiple of what was measured: above one where that lies below the floor."""
 
+    def array(self) -> FloatArray:
+        """Return it as records hold it, (3,): sigma of reprojection, px, sigma and correlation of the depth cue."""
+        return np.array([self.reprojection_sigma_px, self.depth_sigma, self.depth_correlation])
+
+    @classmethod
+    def of_array(cls, noise: FloatArray) -> StaticNoise:
+        """Return what :meth:`array` was made of; records of before had no correlation (2,)."""
+        return cls(*noise.tolist())
+
     def effective_depth_sigma(self, observations_per_track: float) -> float:
         """Return the sigma at which n equally correlated depths of a track carry the information they have.
 

@@ -169,7 +169,8 @@ def further_landmarks(
         some = observations.select(row % parts == part)  # of every frame alike, for weights by frame
         landmarks = mean_lift(some, Cameras.of(state))
         own = State({**state.arrays, LANDMARK: landmarks}, {**state.index, LANDMARK: some.rows()[0]})
-        for solver in (early(config.structure_solver), config.structure_solver):
+        for is_last in (False, True):
+            solver = config.structure_solver if is_last else early(config.structure_solver)
             problem = structure_problem(own, some, noise, config).fix(LOG_SCALE)
             return_free_memory(LARGE)
             own, summary = run(Stage("further_landmarks", problem, solver, part=str(part)), own, hooks)
@@ -178,7 +179,7 @@ def further_landmarks(
             if summary.termination is Termination.CANCELLED:
                 break
             own, some = drop_outliers(own, some, config, dropped)
-            if solver is not config.structure_solver:
+            if not is_last:
                 some = weigh_by_frame(own, some, len(own[POSE]), config)
             if len(some) == 0:
                 break

@@ -80,7 +80,7 @@ class WindowScene:
             "world_T_cam": cameras.world_T_cam, "log_scale": cameras.log_scale, "intrinsics": cameras.intrinsics,
             "landmark": self.landmark, "track": self.track, "row": seen.track, "frame": seen.frame,
             "uv": _as_measured(seen.uv), "depth": _as_measured(seen.depth), "weight": seen.weight,
-            "noise": np.array([noise.reprojection_sigma_px, noise.depth_sigma, noise.depth_correlation]),
+            "noise": noise.array(),
             **({} if self.acceleration is None else self.acceleration.arrays()),
         }  # fmt: skip
 
@@ -99,7 +99,7 @@ class WindowScene:
                 arrays["depth"].astype(np.float64, copy=False),
                 arrays["weight"],
             ),
-            StaticNoise(*arrays["noise"].tolist()),
+            StaticNoise.of_array(arrays["noise"]),
             AccelerationPrior.of_arrays(arrays),
         )
 
