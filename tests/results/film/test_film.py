@@ -170,3 +170,31 @@ def test_h264_is_what_browsers_play(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="ffmpeg"), video.open_mp4(tmp_path / "b.mp4", (33, 47), 10.0) as film:
         film.add(np.zeros((33, 47, 3), np.uint8))
     assert not (tmp_path / "b.mp4").exists()
+
+
+def test_a_film_that_the_disk_did_not_take_is_no_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV reports no failed write: the file is as long as there was space."""
+    monkeypatch.setattr(video, "find_ffmpeg", lambda: None)
+    noise = np.random.default_rng(0).integers(0, 256, (10, 64, 64, 3), np.uint8)
+
+    class Cut:
+        def __init__(self, *args: object) -> None:
+            self._path, self._writer = Path(str(args[0])), writer(*args)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._writer, name)
+
+        def release(self) -> None:
+            self._writer.release()
+            self._path.write_bytes(self._path.read_bytes()[:-2000])
+
+    writer = cv2.VideoWriter
+    Cut.fourcc = writer.fourcc  # type: ignore[attr-defined]
+    monkeypatch.setattr(video.cv2, "VideoWriter", Cut)
+    with (
+        pytest.raises(OutputError, match=r"cannot write .*of 10 pictures can be read again; check free space"),
+        video.open_mp4(tmp_path / "a.mp4", (64, 64), 10.0) as film,
+    ):
+        for picture in noise:
+            film.add(picture)
+    assert not list(tmp_path.iterdir())

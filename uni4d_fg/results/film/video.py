@@ -117,6 +117,7 @@ class _FfmpegFilm:
 class _OpenCvFilm:
     def __init__(self, path: Path, size: tuple[int, int], frames_per_second: float) -> None:
         height, width = size
+        self._path, self._count = path, 0
         self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), frames_per_second, (width, height))
         if not self._writer.isOpened():
             raise OutputError(
@@ -125,9 +126,18 @@ class _OpenCvFilm:
 
     def add(self, picture: ImageArray) -> None:
         self._writer.write(np.ascontiguousarray(picture[..., ::-1]))
+        self._count += 1
 
     def close(self) -> None:
         self._writer.release()
+        # OpenCV says nothing of a disk that is full: the file then has no index, or ends early.
+        written = cv2.VideoCapture(str(self._path))
+        found = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
+        written.release()
+        if found != self._count:
+            raise OutputError(
+                f"cannot write {self._path.name}: {found} of {self._count} pictures can be read again; check free space"
+            )
 
     def abandon(self) -> None:
         self._writer.release()

@@ -64,9 +64,9 @@ class FittedLens:
 def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
     """Return the configuration of stages 1 and 2 for fits: cameras only, E_cam only between consecutive frames.
 
-    All tracks take part.
+    All tracks take part, alike: those that one model explains badly are what another is to be asked for.
     """
-    changes = {"structure": "keep", "covariance_cells": 0, "trim_sigmas": None}
+    changes = {"structure": "keep", "covariance_cells": 0, "trim_sigmas": None, "track_noise_dof": None}
     stage = config.bundle_adjustment.model_copy(update=changes)
     return config.model_copy(update={"bundle_adjustment": stage if consecutive else without_camera_motion(stage)})
 
