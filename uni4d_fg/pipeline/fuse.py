@@ -91,7 +91,7 @@ def fuse_depth(
         config,
         intrinsics,
         frozenset(known.broken),
-        _unmatchable(config, zoom, size),
+        _unmatchable(config, zoom, size, sequence.depth_parallax),
         thread_count(),
         size or plain,
     )
@@ -135,11 +135,15 @@ def _note(sure: ConfidenceWriter | None, told: ToldError, confidence: ImageArray
         told.follow(of_frame)
 
 
-def _unmatchable(config: FusionConfig, zoom: FloatArray | None, size: WorkingSize | None) -> str:
+def _unmatchable(
+    config: FusionConfig, zoom: FloatArray | None, size: WorkingSize | None, depth_parallax: bool | None
+) -> str:
     """Return why there can be no depth from several views, which no size is for; nothing if there can be."""
     core, reason = find_extension()
     if not config.multiview.enabled:
         return "is switched off"
+    if depth_parallax is False:
+        return "is not made of a camera that only rotates"
     if zoom is not None:
         return "is not made of frames that zoom"
     if size is None:
@@ -153,7 +157,10 @@ def _summary(maps: DenseMaps, told: ToldError) -> dict[str, Any]:
     out: dict[str, Any] = {"broken_frames": broken, "matched_frames": matched}
     out["facts"] = [f"depth from several views {maps.unmatched or f'in {matched} of {len(maps.control)} frames'}"]
     error = told.mean()
-    if error is not None:
+    if maps.sequence.depth_parallax is False:
+        out["depth_is_unknown"] = True
+        out["facts"].append("nothing is known of depth: the camera only rotates, and a distance was assumed")
+    elif error is not None:
         out["depth_error"] = error
         out["facts"].append(f"static depth is off by some {100 * error:.1f} % (estimated, but for scale)")
     if broken:

@@ -121,6 +121,12 @@ class Run:
         return not isinstance(cues, dict) or cues.get("metric") is not False
 
     @property
+    def depth_is_unknown(self) -> bool:
+        """Whether everything was put at an assumed distance, because the camera only rotates and no depth was given."""
+        fusion = self.summary.get("stages", {}).get("fusion")
+        return isinstance(fusion, dict) and fusion.get("depth_is_unknown") is True
+
+    @property
     def unit(self) -> str:
         """Unit of lengths."""
         return "m" if self.is_metric else "units"

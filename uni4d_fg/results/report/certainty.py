@@ -29,7 +29,12 @@ def certainty(run: Run) -> Markup:
 
 
 def _scale(run: Run) -> Iterator[str]:
-    if run.is_metric:
+    if run.depth_is_unknown:
+        yield (
+            "Nothing is known of depth: the camera only rotates, and everything was put at one distance. Rotations are "
+            "real; positions, points and clouds are not."
+        )
+    elif run.is_metric:
         yield (
             "Lengths are as long as the depth cue says: if all of its depth is too large by a factor, so is everything "
             "here, and nothing in the video can tell."

@@ -1,0 +1,30 @@
+"""Depth that was assumed, as the camera only rotates: nothing that follows speaks of its accuracy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pipeline_scenes import SMALL, make_config, make_scene
+
+from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.results.export.run import export_run
+from uni4d_fg.results.report.certainty import certainty
+from uni4d_fg.results.run import Run
+
+pytest.importorskip("open3d")
+
+
+@pytest.mark.parametrize("saw_parallax", [False, True])
+def test_a_run_its_report_and_its_exports_say_it(tmp_path: Path, saw_parallax: bool) -> None:
+    sequence = replace(make_scene(SMALL), depth_parallax=saw_parallax)
+    summary = reconstruct(sequence, tmp_path / "run", make_config())
+    facts = " ".join(summary.stages["fusion"]["facts"])
+    assert ("a distance was assumed" in facts) is not saw_parallax
+    assert ("depth_error" in summary.stages["fusion"]) is saw_parallax
+    assert ("static depth is off by some" in facts) is saw_parallax
+    run = Run(tmp_path / "run", lambda: sequence)
+    assert ("Nothing is known of depth" in str(certainty(run))) is not saw_parallax
+    (exported,) = export_run(run, ["colmap"], tmp_path / "exported")
+    assert ("at an assumed distance" in " ".join(exported.warnings)) is not saw_parallax
