@@ -10,6 +10,7 @@ from viewing_samples import copied, opened
 
 from uni4d_fg.cli.viewing import open_run
 from uni4d_fg.errors import InputError
+from uni4d_fg.results.run import Run
 
 
 @pytest.fixture
@@ -41,6 +42,9 @@ def test_every_stage_adds_what_it_found(unfinished: Path, finished_run: Path) ->
     (unfinished / "stages" / "camera_init.npz").unlink()
     with pytest.raises(InputError, match="no cameras to show yet"):
         open_run(unfinished, unfinished=True)
+    # Of a video alone the cues are still being made: it is no sequence yet.
+    with pytest.raises(InputError, match="no cameras to show yet"):
+        Run(unfinished, lambda: pytest.fail("the sequence was opened"), unfinished=True)
 
 
 def test_a_stage_of_an_earlier_run_is_not_shown(unfinished: Path) -> None:

@@ -82,6 +82,7 @@ def reconstruct(
     from uni4d_fg.cues.depth_settings import settings_for_depth
     from uni4d_fg.cues.intermediate import drop_intermediate
     from uni4d_fg.frontend.measurements.imu import read_imu
+    from uni4d_fg.frontend.sequence.naming import order_warnings
     from uni4d_fg.pipeline.asked import check_asked
     from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
     from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -109,6 +110,9 @@ def reconstruct(
     plan = source.plan(opened)
     plan.check()
     check_asked(opened.video, settings, samples)
+    if not (quiet or json):
+        for text in order_warnings(opened.video.frame_names):
+            typer.echo(f"warning: {text}", err=True)  # before the work: it would all be in vain
     files = MeasurementFiles(odometry, gps, relative_poses)
     is_measured = any(given is not None for given in (imu, odometry, gps, relative_poses))
     # What is wrong with a file is said before anything is made.

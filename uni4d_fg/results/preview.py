@@ -23,6 +23,16 @@ _MOTION = {"points": 3, "observed": 2, "track": 1, "instance": 1}
 _STAGES = (("camera_init", _CAMERAS), ("bundle_adjustment", _SCENE), ("nonrigid", _MOTION))
 
 
+def check_has_cameras(root: Path) -> None:
+    """Check that an unfinished run is far enough to be shown: before its sequence is opened, which may lack cues yet.
+
+    Raises:
+        InputError: If no stage has found cameras yet.
+    """
+    if not (root / "stages" / f"{_STAGES[0][0]}.npz").is_file():
+        raise InputError(f"{root}: the run is not finished, and has no cameras to show yet; try again later")
+
+
 def preview(root: Path, labels: Path, sequence: Sequence | Video) -> tuple[Reconstruction, str]:
     """Return what the stages of an unfinished run have found, and the name of the newest of them.
 
@@ -34,6 +44,7 @@ def preview(root: Path, labels: Path, sequence: Sequence | Video) -> tuple[Recon
     Raises:
         InputError: If no stage has found cameras yet, or not for every frame of the sequence.
     """
+    check_has_cameras(root)
     found: dict[str, npt.NDArray[Any]] = {}
     newest, written = "", 0
     for name, ranks in _STAGES:
@@ -43,8 +54,6 @@ def preview(root: Path, labels: Path, sequence: Sequence | Video) -> tuple[Recon
             break
         found |= load_npz(path, ranks)
         newest, written = name, path.stat().st_mtime_ns
-    if not newest:
-        raise InputError(f"{root}: the run is not finished, and has no cameras to show yet; try again later")
     if len(found["world_T_cam"]) != sequence.num_frames:
         raise InputError(
             f"{root}: the run is not finished, and a video with repeated frames has no preview; wait for its end"

@@ -26,7 +26,7 @@ from uni4d_fg.results.confidence_store import read_confidence
 from uni4d_fg.results.depth_store import read_depth
 from uni4d_fg.results.io import load_reconstruction
 from uni4d_fg.results.labels_io import load_labels
-from uni4d_fg.results.preview import preview
+from uni4d_fg.results.preview import check_has_cameras, preview
 from uni4d_fg.results.run_folder import RunFolder, is_finished
 from uni4d_fg.results.summary_file import read_summary
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -89,6 +89,7 @@ class Run:
         self.summary: dict[str, Any] = read_summary(folder.summary)
 
     def _open_unfinished(self, read_sequence: SequenceReader) -> None:
+        check_has_cameras(self.folder.root)
         sequence = read_sequence()
         self._read_sequence = lambda: sequence
         self.reconstruction, stage = preview(self.folder.root, self.folder.labels, sequence)
