@@ -305,6 +305,18 @@ def test_evaluate_finds_the_sequence_of_the_run(cli: Run, finished: Path, scene:
     assert report["trajectory"]["ate_m"] < 0.1
 
 
+def test_evaluate_takes_the_frames_of_a_sequence_that_the_run_was_made_from(
+    cli: Run, scene: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    assert cli("reconstruct", scene, "--out", run, "--stride", "2", "--start", "1", "--config", "fast")[0] == 0
+    code, out, _ = cli("evaluate", run, "--sequence", scene, "--json")
+    report = json.loads(out)
+    assert (code, report["frames"]) == (0, 4)
+    assert report["trajectory"]["poses"] == 4
+    assert report["trajectory"]["ate_m"] < 0.1
+
+
 def test_evaluate_falls_back_to_the_summary_and_says_what_is_missing(cli: Run, finished: Path, tmp_path: Path) -> None:
     for name in ("reconstruction.npz", "labels.npz", "summary.json"):
         (tmp_path / name).write_bytes((finished / name).read_bytes())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from uni4d_fg.cli import options
 from uni4d_fg.cli.console import print_json
 from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.runs import SequenceInput, stored_input
+from uni4d_fg.frontend.sequence.model import Sequence
 
 
 def evaluate(
@@ -25,22 +27,38 @@ def evaluate(
     """Score a run against the ground truth of its sequence."""
     from uni4d_fg.results.evaluate.run import evaluate_run
     from uni4d_fg.results.evaluate.table import format_report
+    from uni4d_fg.results.io import load_reconstruction
+    from uni4d_fg.results.run_folder import RunFolder
     from uni4d_fg.results.shot_list import finished_shots, is_split, refuse_split
 
     if sequence is not None:
         refuse_split(run)
     reports = []
     for folder in finished_shots(run) if is_split(run) else [run]:
-        source = stored_input(folder)
-        if sequence is not None:
-            source = SequenceInput.of(
+        stored = stored_input(folder)
+        if sequence is None:
+            truth = stored.read()
+        elif sequence.is_file():  # the run's own video, elsewhere: its cues are in the run
+            truth = replace(stored, root=str(sequence.resolve())).read()
+        else:
+            given = SequenceInput.of(
                 sequence, layout, depth, None, None, depth_gt_scale=depth_gt_scale, known_intrinsics=False
             )
-        reports.append(evaluate_run(folder, source.read(), max_depth_m=max_depth))
+            truth = _frames_of_run(given, stored, load_reconstruction(RunFolder(folder).reconstruction).num_frames)
+        reports.append(evaluate_run(folder, truth, max_depth_m=max_depth))
     if json:
         print_json([report.to_dict() for report in reports] if is_split(run) else reports[0].to_dict())
     else:
         typer.echo("\n".join(format_report(report) for report in reports), nl=False)
+
+
+def _frames_of_run(given: SequenceInput, stored: SequenceInput, num_frames: int) -> Sequence:
+    """Return a sequence as it is, or the frames of it that a run was made from where that makes their number right."""
+    whole = given.read()
+    if whole.num_frames == num_frames:
+        return whole
+    chosen = replace(given, start=stored.start, stop=stored.stop, stride=stored.stride, max_size=stored.max_size).read()
+    return chosen if chosen.num_frames == num_frames else whole
 
 
 def config(

@@ -191,10 +191,12 @@ def test_a_film_that_the_disk_did_not_take_is_no_film(tmp_path: Path, monkeypatc
     writer = cv2.VideoWriter
     Cut.fourcc = writer.fourcc  # type: ignore[attr-defined]
     monkeypatch.setattr(video.cv2, "VideoWriter", Cut)
-    with (
-        pytest.raises(OutputError, match=r"cannot write .*of 10 pictures can be read again; check free space"),
-        video.open_mp4(tmp_path / "a.mp4", (64, 64), 10.0) as film,
-    ):
-        for picture in noise:
-            film.add(picture)
+
+    def write() -> None:
+        with video.open_mp4(tmp_path / "a.mp4", (64, 64), 10.0) as film:
+            for picture in noise:
+                film.add(picture)
+
+    with pytest.raises(OutputError, match=r"cannot write .*of 10 pictures can be read again; check free space"):
+        write()
     assert not list(tmp_path.iterdir())
