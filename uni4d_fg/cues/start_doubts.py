@@ -9,18 +9,11 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.start_limits import MUCH_UNEXPLAINED, OPEN_FOCAL, RIVAL_DEGREES, RIVAL_DEGREES_PER_FRAME
 from uni4d_fg.cues.structure.motion import Structure
 from uni4d_fg.cues.structure.rivals import rotation_difference
 from uni4d_fg.frontend.sequence.problems import some_of
 
-_OPEN_FOCAL = 0.06
-"""An interval of focal lengths that reaches farther than this part of the focal length is warned of."""
-_RIVAL_DEGREES = 5.0
-"""Cameras of another start that are turned by more than this against the result are warned of, ..."""
-_RIVAL_DEGREES_PER_FRAME = 0.5
-"""... and those whose turns from frame to frame differ by more than this."""
-_MUCH_UNEXPLAINED = 0.6
-"""More than this part of what was held out is warned of."""
 _FEW_FRAMES = 0.5
 """Fewer frames with a pose than this part of the video are warned of."""
 
@@ -68,7 +61,7 @@ def doubts_of_masks(before: FloatArray, after: FloatArray) -> list[str]:
         after: (T, 4, 4) cameras from the tracks outside the masks.
     """
     degrees, per_frame = rotation_difference(before, after, np.arange(len(before)))
-    if degrees <= _RIVAL_DEGREES and per_frame <= _RIVAL_DEGREES_PER_FRAME:
+    if degrees <= RIVAL_DEGREES and per_frame <= RIVAL_DEGREES_PER_FRAME:
         return []
     return [
         f"the cameras turned by {degrees:.0f} degrees ({per_frame:.2f} per frame) when what seems to move was masked: "
@@ -79,7 +72,7 @@ def doubts_of_masks(before: FloatArray, after: FloatArray) -> list[str]:
 def _open_focal(structure: Structure, remedy: str) -> list[str]:
     focal = float(np.mean(structure.intrinsics[:2]))
     below, above = structure.focal.relative(focal)
-    if max(-below, above) <= _OPEN_FOCAL:
+    if max(-below, above) <= OPEN_FOCAL:
         return []
     low = "any shorter one" if structure.focal.low_is_open else f"{structure.focal.low:.0f}"
     high = "any longer one" if structure.focal.high_is_open else f"{structure.focal.high:.0f} px"
@@ -92,7 +85,7 @@ def _open_focal(structure: Structure, remedy: str) -> list[str]:
 
 def _doubtful_start(structure: Structure) -> list[str]:
     warnings = []
-    if structure.unexplained > _MUCH_UNEXPLAINED:
+    if structure.unexplained > MUCH_UNEXPLAINED:
         warnings.append(
             f"the cameras found explain only {100 * (1.0 - structure.unexplained):.0f} % of the tracks that were held "
             "out to judge them: much may move, or the tracks are bad; look before you trust them, or give masks"
@@ -100,7 +93,7 @@ def _doubtful_start(structure: Structure) -> list[str]:
     against = [
         rival
         for rival in structure.rivals
-        if rival.degrees > _RIVAL_DEGREES or rival.degrees_per_frame > _RIVAL_DEGREES_PER_FRAME
+        if rival.degrees > RIVAL_DEGREES or rival.degrees_per_frame > RIVAL_DEGREES_PER_FRAME
     ]
     if against:
         worst = max(against, key=lambda rival: rival.degrees)

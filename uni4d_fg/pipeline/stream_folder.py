@@ -94,10 +94,6 @@ class StreamFolder:
         self._rewrite_trajectory()
         return True
 
-    def close(self) -> None:
-        """Write what is left as a last part."""
-        self._write_part()
-
     def frames(self) -> list[FinishedFrame]:
         """Read all finished frames in order."""
         return self.read().frames()

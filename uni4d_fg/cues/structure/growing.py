@@ -102,7 +102,7 @@ class GrowingScene:
         new = np.zeros(self.num_tracks, dtype=bool)
         new[self.row[a[found.inlier]]] = True
         self.triangulate(new)
-        self._normalize(pair.first)
+        self._normalize()
         return int(np.isfinite(self.position[:, 0]).sum())
 
     def next_frame(self, excluded: set[int]) -> int | None:
@@ -118,12 +118,7 @@ class GrowingScene:
         """Find a frame's pose from the points it sees (resection with RANSAC), then new points; False if it fails."""
         settings = self.config.geometric_depth
         mine = np.flatnonzero((self.observations.frame == frame) & np.isfinite(self.position[self.row, 0]))
-        known = np.flatnonzero(self.registered)
-        nearest = int(known[np.argmin(np.abs(known - frame))])
-        pose = _resect(
-            self.position[self.row[mine]], self.observations.uv[mine], self.intrinsics,
-            self.world_T_cam[nearest], settings,
-        )  # fmt: skip
+        pose = _resect(self.position[self.row[mine]], self.observations.uv[mine], self.intrinsics, settings)
         if pose is None:
             return False
         self.world_T_cam[frame], self.registered[frame] = pose, True
@@ -316,8 +311,8 @@ class GrowingScene:
             count,
         )
 
-    def _normalize(self, frame: int) -> None:
-        """Bring the median depth in a frame to ``median_depth`` (the world is that camera)."""
+    def _normalize(self) -> None:
+        """Bring the median depth in the first frame of the pair, which is the world, to ``median_depth``."""
         z = self.position[np.isfinite(self.position[:, 0]), 2]
         if len(z) == 0:
             return
@@ -332,16 +327,14 @@ def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustm
 
 
 def _resect(
-    points: FloatArray, uv: FloatArray, intrinsics: FloatArray, guess: FloatArray, config: GeometricDepthConfig
+    points: FloatArray, uv: FloatArray, intrinsics: FloatArray, config: GeometricDepthConfig
 ) -> FloatArray | None:
     """Return the pose (4, 4) of a camera that sees N world points (N, 3) at uv (N, 2), or None."""
     if len(points) < config.min_pose_points:
         return None
     matrix = intrinsics_matrix(intrinsics)
-    start = se3.inverse(guess)
-    rotation, translation = cv2.Rodrigues(start[:3, :3])[0], start[:3, 3:].copy()
     found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, uv, matrix, None, rvec=rotation, tvec=translation, useExtrinsicGuess=False,
+        points, uv, matrix, None,
         iterationsCount=config.resection_trials, reprojectionError=config.max_reprojection_px, confidence=0.9999,
         flags=cv2.SOLVEPNP_SQPNP,
     )  # fmt: skip

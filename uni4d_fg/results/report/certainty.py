@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.counted import counted
+from uni4d_fg.cues.start_limits import MUCH_UNEXPLAINED, OPEN_FOCAL, RIVAL_DEGREES
 from uni4d_fg.results.measures import pose_sigmas, scene_depth
 from uni4d_fg.results.report.markup import Markup, bullets, fold, number, section, table
 from uni4d_fg.results.run import Run
 
-_OPEN = 0.06
-"""An interval of focal lengths that reaches no farther than this part of the focal length is narrow."""
-_MUCH_UNEXPLAINED = 0.6
-_TURNED_DEG = 5.0
 _CERTAIN = 0.005
 """A position that is known to this part of the scene's depth is well determined."""
 _UNCERTAIN = 0.02
@@ -50,7 +47,7 @@ def _start(run: Run) -> Iterator[str]:
     if focal is not None and low is not None and high is not None:
         is_open = start.get("focal_is_open", (False, False))
         reach = max(focal - low, high - focal) / focal
-        if any(is_open) or reach > _OPEN:
+        if any(is_open) or reach > OPEN_FOCAL:
             below = "any shorter focal length" if is_open[0] else f"{low:.0f} px"
             above = "any longer one" if is_open[1] else f"{high:.0f} px"
             yield (
@@ -64,7 +61,7 @@ def _start(run: Run) -> Iterator[str]:
             )
     unexplained = start.get("unexplained")
     if unexplained is not None:
-        verdict = "that is little: much may move, or tracks are bad" if unexplained > _MUCH_UNEXPLAINED else "as usual"
+        verdict = "that is little: much may move, or tracks are bad" if unexplained > MUCH_UNEXPLAINED else "as usual"
         yield (
             f"The first cameras explain {100 * (1 - unexplained):.0f} % of the tracks that were held out to judge them "
             f"({verdict})."
@@ -72,7 +69,7 @@ def _start(run: Run) -> Iterator[str]:
     starts = start.get("starts", [])
     if starts:
         turned = max(rival.get("degrees") or 0.0 for rival in starts)
-        if turned > _TURNED_DEG:
+        if turned > RIVAL_DEGREES:
             yield (
                 "The cameras are ambiguous: another start of the search explains the tracks nearly as well, with "
                 f"cameras that are turned by {turned:.0f} degrees."

@@ -48,9 +48,6 @@ class FrameStatus(str, Enum):
     """Ignored: its timestamp is earlier than that of the frame before."""
 
 
-IGNORED = (FrameStatus.REPEATED, FrameStatus.OUT_OF_ORDER)
-
-
 @dataclass(frozen=True)
 class DynamicPoints:
     """Moving points of one frame."""
