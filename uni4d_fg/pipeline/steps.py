@@ -174,7 +174,7 @@ def _scene_summary(sequence: Sequence, labelled: LabelledTracks, scene: StaticSc
         summary["joined_tracks"] = scene.joined
         summary["facts"].append(f"{scene.joined} tracks joined to earlier ones of the same point")
     if scene.acceleration is not None:
-        summary["facts"] += scene.acceleration.facts()
+        summary["facts"] += scene.acceleration.facts("m" if sequence.depth_is_metric else "units")
     summary["exact_energy"] = paper_energy(scene, config.normalization)
     return summary
 

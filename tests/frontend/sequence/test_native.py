@@ -139,6 +139,12 @@ def test_names_that_would_change_the_order_become_numbers(tmp_path: Path, names:
     assert_same(read, written)
 
 
+def test_intrinsics_may_be_four_numbers(tmp_path: Path) -> None:
+    root = native_folder(tmp_path)
+    np.save(root / "K.npy", np.array([100.0, 101.0, 8.0, 6.0]))
+    np.testing.assert_allclose(read_native(root).intrinsics, [100.0, 101.0, 8.0, 6.0])
+
+
 def test_per_frame_intrinsics_are_averaged(tmp_path: Path) -> None:
     root = native_folder(tmp_path)
     per_frame = np.tile(np.load(root / "K.npy"), (FRAMES, 1, 1))
@@ -253,7 +259,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda r: [p.rename(p.with_suffix(".jpg")) for p in list((r / "masks").iterdir())],
         r"masks: has no \.png, \.npy file \(it holds frame_0000\.jpg",
     ),
-    "K shape": (saver("K.npy", np.ones(4)), r"K\.npy: has shape \(4,\)"),
+    "K shape": (saver("K.npy", np.ones(5)), r"K\.npy: has shape \(5,\)"),
     "K count": (saver("K.npy", np.ones((3, 3, 3))), "has 3 matrices for 4 frames"),
     "K nan": (k_matrix(0, 2, np.nan), r"K\.npy: has NaN"),
     "K focal": (k_matrix(0, 0, -5), "focal length of -5 px"),

@@ -50,7 +50,7 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
     """Read the shared intrinsics of a video.
 
     Args:
-        path: ``.npy`` file of one (3, 3) matrix or of (T, 3, 3), whose mean is taken.
+        path: ``.npy`` file of one (3, 3) matrix, of (T, 3, 3), whose mean is taken, or of (4,) fx, fy, cx, cy, px.
         num_frames: T.
         size: (height, width), px.
 
@@ -62,8 +62,10 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
         InputError: If the file cannot be read or does not hold pinhole matrices without skew.
     """
     values = load_npy(path, memory_map=True)
+    if values.shape == (4,):
+        values = intrinsics_matrix(values)
     if values.ndim not in (2, 3) or values.shape[-2:] != (3, 3) or values.size == 0:
-        raise SequenceProblem(path, f"has shape {values.shape}", "save one (3, 3) matrix, or (T, 3, 3)")
+        raise SequenceProblem(path, f"has shape {values.shape}", "save one (3, 3) matrix, (T, 3, 3), or (4,) fx, fy, cx, cy")
     if values.size // 9 not in (1, num_frames):
         raise SequenceProblem(
             path,

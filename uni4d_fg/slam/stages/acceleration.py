@@ -70,9 +70,9 @@ class AccelerationPrior:
         linear, angular = (None if np.isnan(s) else float(s) for s in arrays["acceleration_sigma"])
         return cls(arrays["acceleration_times"], linear, angular)
 
-    def facts(self) -> list[str]:
+    def facts(self, length_unit: str = "m") -> list[str]:
         """Return what a summary says of it."""
-        sigmas = ((self.linear, "m/s^2", "linear"), (self.angular, "rad/s^2", "angular"))
+        sigmas = ((self.linear, f"{length_unit}/s^2", "linear"), (self.angular, "rad/s^2", "angular"))
         known = [f"{s:.2g} {unit}" for s, unit, name in sigmas if s is not None and name not in self.is_weak]
         return ["the camera's acceleration is taken for " + " and ".join(known)] if known else []
 
