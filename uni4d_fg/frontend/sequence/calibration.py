@@ -65,7 +65,9 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
     if values.shape == (4,):
         values = intrinsics_matrix(values)
     if values.ndim not in (2, 3) or values.shape[-2:] != (3, 3) or values.size == 0:
-        raise SequenceProblem(path, f"has shape {values.shape}", "save one (3, 3) matrix, (T, 3, 3), or (4,) fx, fy, cx, cy")
+        raise SequenceProblem(
+            path, f"has shape {values.shape}", "save one (3, 3) matrix, (T, 3, 3), or (4,) fx, fy, cx, cy"
+        )
     if values.size // 9 not in (1, num_frames):
         raise SequenceProblem(
             path,
