@@ -57,6 +57,26 @@ def test_a_pinhole_stays_one(seed: int) -> None:
     assert len(found.solves) < 60  # of stage 1, of stage 2, and two of a few steps
 
 
+def test_one_picture_again_and_again_has_no_lens(barrel: Sequence) -> None:
+    tracks = labelled(barrel)
+    first = tracks.tracks.visible[:, :1] & (tracks.weight[:, :1] > 0)
+    jitter = np.random.default_rng(0).normal(scale=1e-3, size=tracks.tracks.uv.shape).astype(np.float32)
+    still = dataclasses.replace(
+        tracks,
+        tracks=dataclasses.replace(
+            tracks.tracks,
+            uv=tracks.tracks.uv[:, :1] + jitter,
+            visible=np.repeat(first, tracks.tracks.num_frames, axis=1),
+        ),
+        weight=np.where(first, tracks.weight[:, :1], 0.0) * np.ones_like(tracks.weight),
+        depth=tracks.depth[:, :1] * np.ones_like(tracks.depth),
+    )
+    found = calibrate_lens(still, barrel.image_size, barrel.intrinsics, config())
+    assert found.lens == PINHOLE
+    assert found.zoom is None
+    assert "nothing is left for a lens or a zoom" in " ".join(found.facts())
+
+
 def test_without_static_tracks_there_is_nothing_to_find(barrel: Sequence) -> None:
     tracks = labelled(barrel)
     with pytest.raises(DegenerateProblemError, match="the lens: there is no static track"):
