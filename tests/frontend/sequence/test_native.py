@@ -139,12 +139,6 @@ def test_names_that_would_change_the_order_become_numbers(tmp_path: Path, names:
     assert_same(read, written)
 
 
-def test_intrinsics_may_be_four_numbers(tmp_path: Path) -> None:
-    root = native_folder(tmp_path)
-    np.save(root / "K.npy", np.array([100.0, 101.0, 8.0, 6.0]))
-    np.testing.assert_allclose(read_native(root).intrinsics, [100.0, 101.0, 8.0, 6.0])
-
-
 def test_per_frame_intrinsics_are_averaged(tmp_path: Path) -> None:
     root = native_folder(tmp_path)
     per_frame = np.tile(np.load(root / "K.npy"), (FRAMES, 1, 1))
