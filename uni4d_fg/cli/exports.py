@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -63,7 +62,7 @@ def export(
 
     def open_sequence() -> Sequence:
         stored = stored_input(run)
-        return (stored if sequence is None else replace(stored, root=str(sequence.resolve()))).read()
+        return (stored if sequence is None else stored.moved_to(sequence)).read()
 
     choices = ExportOptions(
         masks=masks,

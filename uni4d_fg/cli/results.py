@@ -27,8 +27,6 @@ def evaluate(
     """Score a run against the ground truth of its sequence."""
     from uni4d_fg.results.evaluate.run import evaluate_run
     from uni4d_fg.results.evaluate.table import format_report
-    from uni4d_fg.results.io import load_reconstruction
-    from uni4d_fg.results.run_folder import RunFolder
     from uni4d_fg.results.shot_list import finished_shots, is_split, refuse_split
 
     if sequence is not None:
@@ -39,12 +37,12 @@ def evaluate(
         if sequence is None:
             truth = stored.read()
         elif sequence.is_file():  # the run's own video, elsewhere: its cues are in the run
-            truth = replace(stored, root=str(sequence.resolve())).read()
+            truth = stored.moved_to(sequence).read()
         else:
             given = SequenceInput.of(
                 sequence, layout, depth, None, None, depth_gt_scale=depth_gt_scale, known_intrinsics=False
             )
-            truth = _frames_of_run(given, stored, load_reconstruction(RunFolder(folder).reconstruction).num_frames)
+            truth = _frames_of_run(given, stored, folder)
         reports.append(evaluate_run(folder, truth, max_depth_m=max_depth))
     if json:
         print_json([report.to_dict() for report in reports] if is_split(run) else reports[0].to_dict())
@@ -52,13 +50,20 @@ def evaluate(
         typer.echo("\n".join(format_report(report) for report in reports), nl=False)
 
 
-def _frames_of_run(given: SequenceInput, stored: SequenceInput, num_frames: int) -> Sequence:
+def _frames_of_run(given: SequenceInput, stored: SequenceInput, run: Path) -> Sequence:
     """Return a sequence as it is, or the frames of it that a run was made from where that makes their number right."""
+    from uni4d_fg.results.io import load_reconstruction
+    from uni4d_fg.results.run_folder import RunFolder
+
     whole = given.read()
+    chosen = replace(given, start=stored.start, stop=stored.stop, stride=stored.stride, max_size=stored.max_size)
+    if chosen == given:
+        return whole
+    num_frames = load_reconstruction(RunFolder(run).reconstruction).num_frames
     if whole.num_frames == num_frames:
         return whole
-    chosen = replace(given, start=stored.start, stop=stored.stop, stride=stored.stride, max_size=stored.max_size).read()
-    return chosen if chosen.num_frames == num_frames else whole
+    part = chosen.read()
+    return part if part.num_frames == num_frames else whole
 
 
 def config(

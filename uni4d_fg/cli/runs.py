@@ -97,6 +97,10 @@ class SequenceInput:
             depth_gt_scale, known_intrinsics, **more,
         )  # fmt: skip
 
+    def moved_to(self, root: Path) -> SequenceInput:
+        """Return the same input at another place; cues that were made for it stay where they are."""
+        return replace(self, root=str(root.resolve()))
+
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments of :func:`read_sequence` and :func:`validate_sequence`."""
         names = ("layout", "depth", "masks", "tracks", "depth_gt_scale", "known_intrinsics")

@@ -40,6 +40,7 @@ from uni4d_fg.results.fusion.static_depth import (
 )
 from uni4d_fg.results.fusion.told_error import final_confidence
 from uni4d_fg.results.fusion.upsampling import upsample_guided
+from uni4d_fg.slam.stages.scene import StaticNoise
 
 _CARRIED_REACH, _CARRIED_FROM = 6, 2
 """A frame without a cue takes the depth of this many frames at most this far away."""
@@ -456,7 +457,7 @@ class DenseMaps:
     @property
     def _noise(self) -> float:
         """Of the cue at landmarks, a standard deviation of the log depth."""
-        return float(self.scene["noise"][1])
+        return StaticNoise.of_array(self.scene["noise"]).depth_sigma
 
     def _landmark_cues(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where a frame sees landmarks, (N, 2) working px, log depth over the cue, and the log cue (N,)."""

@@ -9,6 +9,7 @@ from uni4d_fg.factors.projection import chain_to_world_point, projection_derivat
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.pipeline.steps import Arrays
+from uni4d_fg.slam.stages.scene import StaticNoise
 
 _LEAST_SIGMA = 0.004
 """Landmarks that are known this well all count alike: standard deviation of log depth."""
@@ -40,17 +41,17 @@ def landmark_shares(labelled: LabelledTracks, scene: Arrays, intrinsics: FloatAr
         by_x, _ = projection_derivatives(np.broadcast_to(intrinsics[frame], (len(x), 4)), x)
         jacobian = chain_to_world_point(by_x, np.broadcast_to(pose, (len(x), 4, 4)))
         information[seen] += np.swapaxes(jacobian, 1, 2) @ jacobian
-    noise_px, noise_depth = scene["noise"][:2].tolist()
+    noise = StaticNoise.of_array(scene["noise"])
     first = np.argmax(weight, axis=1)
     away = points - poses[first, :3, 3]
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-    information /= noise_px**2
+    information /= noise.reprojection_sigma_px**2
     information += np.eye(3) * 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None]
     information[np.trace(information, axis1=1, axis2=2) <= 0] = np.eye(3)
     toward = away / distance[:, None]
     variance = np.einsum("li,lij,lj->l", toward, np.linalg.inv(information), toward) / distance**2
     # Landmarks also know what the cue says in all of their frames.
-    of_cue = np.count_nonzero(weight, axis=1) / max(noise_depth, 1e-6) ** 2
+    of_cue = np.count_nonzero(weight, axis=1) / max(noise.depth_sigma, 1e-6) ** 2
     sigma = 1 / np.sqrt(1 / np.maximum(variance, 1e-12) + of_cue)
     shares: FloatArray = np.minimum(max(_LEAST_SIGMA, _WORSE * float(np.median(sigma))) / sigma, 1.0) ** 2
     return shares

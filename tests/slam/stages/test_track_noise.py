@@ -11,7 +11,8 @@ from uni4d_fg.geometry.alignment import align_points
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, adjust_bundle
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras
-from uni4d_fg.slam.stages.track_noise import relative_variance, weigh_by_track
+from uni4d_fg.slam.stages.track_noise import relative_variance
+from uni4d_fg.slam.stages.weights import weigh_by_residuals
 
 FRAMES, TRACKS = 10, 300
 POSES = camera_path(FRAMES)
@@ -68,10 +69,10 @@ def test_tracks_that_are_alike_keep_their_weights() -> None:
     scene = adjust_bundle(
         observations, Cameras(POSES, K, np.zeros(FRAMES)), K, config(), Freedom(poses=True, intrinsics=True)
     )
-    factor = weigh_by_track(scene.state(), observations, config()).weight / observations.weight
+    factor = weigh_by_residuals(scene.state(), observations, config()).weight / observations.weight
     assert np.median(factor) == pytest.approx(1.0, abs=1e-9)
     assert factor.min() > 0.7
     assert factor.max() < 1.3
     np.testing.assert_array_equal(
-        weigh_by_track(scene.state(), observations, config(track_noise_dof=None)).weight, observations.weight
+        weigh_by_residuals(scene.state(), observations, config(track_noise_dof=None)).weight, observations.weight
     )

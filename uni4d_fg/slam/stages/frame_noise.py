@@ -8,10 +8,8 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray, rows_by_group
 from uni4d_fg.config.stages import BundleAdjustmentConfig
-from uni4d_fg.factors.state import State
 from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
-from uni4d_fg.slam.stages.static_outliers import reprojection_residual
 
 _ENOUGH = 20
 """Observations of a frame from which its noise can be told."""
@@ -40,16 +38,14 @@ def relative_noise(residual: FloatArray, frame: np.ndarray, num_frames: int, flo
 
 
 def weigh_by_frame(
-    state: State, observations: Observations, num_frames: int, config: BundleAdjustmentConfig
+    residual: FloatArray, observations: Observations, num_frames: int, config: BundleAdjustmentConfig
 ) -> Observations:
-    """Lower the weights in frames whose residuals are more than ``blurred_frames`` times those of the frames beside.
+    """Lower the weights in frames whose residuals (N, 2), px, exceed ``blurred_frames`` times those of frames beside.
 
     Their variance is then taken for what the residuals say; all other frames keep their weights as they are.
     """
     if config.blurred_frames is None:
         return observations
-    _, row = observations.rows()
-    residual = reprojection_residual(state, observations, row)
     ratio = relative_noise(residual, observations.frame, num_frames, config.min_reprojection_sigma_px)
     factor = np.where(ratio > config.blurred_frames, np.maximum(ratio, 1.0) ** -2.0, 1.0)
     if (factor == 1.0).all():

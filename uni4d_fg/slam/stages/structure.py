@@ -26,7 +26,7 @@ from uni4d_fg.slam.stages.frame_noise import weigh_by_frame
 from uni4d_fg.slam.stages.lifting import lift, mean_per_row
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
-from uni4d_fg.slam.stages.static_outliers import drop_outliers, measure_noise
+from uni4d_fg.slam.stages.static_outliers import drop_outliers, measure_noise, reprojection_residual
 
 LARGE = 256 << 20
 """Bytes; more free memory than this is handed back before a solve, of which a long video needs as much again."""
@@ -180,7 +180,8 @@ def further_landmarks(
                 break
             own, some = drop_outliers(own, some, config, dropped)
             if not is_last:
-                some = weigh_by_frame(own, some, len(own[POSE]), config)
+                residual = reprojection_residual(own, some, some.rows()[1])
+                some = weigh_by_frame(residual, some, len(own[POSE]), config)
             if len(some) == 0:
                 break
         points.append(own)

@@ -12,10 +12,8 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.stages import BundleAdjustmentConfig
-from uni4d_fg.factors.state import State
 from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.observations import Observations
-from uni4d_fg.slam.stages.static_outliers import reprojection_residual
 
 _OWN_DOF = 2.0
 """Degrees of freedom that a track's residuals are worth for its own variance: the errors of one track are alike from
@@ -43,12 +41,19 @@ def relative_variance(squared: FloatArray, row: IntArray, prior_dof: float) -> F
     return np.asarray((prior_dof + _OWN_DOF * own) / (prior_dof + _OWN_DOF))
 
 
-def weigh_by_track(state: State, observations: Observations, config: BundleAdjustmentConfig) -> Observations:
-    """Weigh the observations of each track by the inverse of its variance; those of the median track keep theirs."""
+def weigh_by_track(
+    residual: FloatArray, row: IntArray, observations: Observations, config: BundleAdjustmentConfig
+) -> Observations:
+    """Weigh the observations of each track by the inverse of its variance; those of the median track keep theirs.
+
+    Args:
+        residual: (N, 2) px.
+        row: (N,) track of each, 0 .. M - 1.
+        observations: N observations.
+        config: Stage 2.
+    """
     if config.track_noise_dof is None:
         return observations
-    _, row = observations.rows()
-    residual = reprojection_residual(state, observations, row)
     sigma = max(robust_sigma(residual), config.min_reprojection_sigma_px)
     # Weights are inverse variances: with them an observation far from its query frame is no sign of a bad track.
     squared = observations.weight / observations.weight.mean() * np.sum(residual**2, axis=1) / sigma**2
