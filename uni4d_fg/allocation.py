@@ -14,6 +14,8 @@ import sys
 from functools import cache
 from typing import Any
 
+LARGE = 256 << 20
+"""Bytes of free memory above which it is handed back before a solve or a stage, whose arrays have other sizes."""
 SETTINGS = {"MALLOC_ARENA_MAX": 1, "MALLOC_MMAP_THRESHOLD_": 128 << 20, "MALLOC_TRIM_THRESHOLD_": 128 << 20}
 """glibc's environment variables: number of heaps; bytes from which an array is mapped; free bytes that are kept."""
 

@@ -147,7 +147,12 @@ def test_exact_cues_of_a_camera_at_rest(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0])
 def test_a_video_without_any_depth(tmp_path: Path, scene: Sequence, value: float) -> None:
     nothing = np.full_like(depth_of(scene), value)
-    assert_refused(with_depth(scene, nothing), tmp_path / "estimate", "0 static observations have depth", "depth")
+    with pytest.raises(InputError, match="missing everywhere"):
+        reconstruct(with_depth(scene, nothing), tmp_path / "estimate", make_config())
+    assert not (tmp_path / "estimate").exists()
+    corner = nothing.copy()
+    corner[:, 0, 0] = 2.0
+    assert_refused(with_depth(scene, corner), tmp_path / "corner", "0 static observations have depth", "depth")
     _, result = run_sound(with_depth(with_true_poses(scene), nothing), tmp_path / "fixed", make_config(*FIXED))
     assert len(result.landmarks) == len(result.dynamic_points) == 0
 

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
+from uni4d_fg.counted import counted
 from uni4d_fg.files import json_text
 from uni4d_fg.frontend.sequence.report import ItemSummary, ValidationReport
 
@@ -57,7 +58,7 @@ def validation_text(report: ValidationReport) -> str:
     for severity in ("error", "warning", "info"):
         for finding in report.of(severity):
             lines += ["", f"{severity}: {finding.item}: {finding.message}", f"    to do: {finding.remedy}"]
-    counts = ", ".join(f"{len(report.of(s))} {s}s" for s in ("error", "warning"))
+    counts = ", ".join(counted(len(report.of(s)), s) for s in ("error", "warning"))
     verdict = "can be reconstructed" if report.ok else "cannot be reconstructed as it is"
     return "\n".join([*lines, "", f"{verdict}: {counts}"])
 

@@ -22,6 +22,7 @@ _PACKAGES = ("numpy", "scipy", "gtsam", "opencv-python-headless", "open3d", "mat
 _EXTRAS = {
     "cues": ("onnxruntime", "depth, masks and tracks by networks"),
     "view": ("viser", "the interactive view"),
+    "render": ("imageio_ffmpeg", "films in H.264"),
     "export": ("rerun", "rerun files (.rrd)"),
     "adam": ("torch", "comparison with Adam"),
     "models": ("pooch", "fetching published networks"),

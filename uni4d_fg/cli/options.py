@@ -124,11 +124,12 @@ WindowScheduler = Annotated[
     ),
 ]  # fmt: skip
 WindowTimeLimit = Annotated[
-    float,
+    float | None,
     typer.Option(
-        "--time-limit", metavar="MINUTES", help="With --workers: a window that takes longer is ended and tried again."
+        "--time-limit", metavar="MINUTES", show_default=False,
+        help="With --workers: a window that takes longer is ended and tried again; 360 if not given.",
     ),
-]
+]  # fmt: skip
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a run; finished stages are kept.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]

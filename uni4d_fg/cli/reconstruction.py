@@ -40,7 +40,7 @@ def reconstruct(
     overlap: options.WindowOverlap = None,
     workers: options.WindowProcesses = None,
     scheduler: options.WindowScheduler = None,
-    time_limit: options.WindowTimeLimit = 360.0,
+    time_limit: options.WindowTimeLimit = None,
     resume: options.Resume = False,
     overwrite: options.Overwrite = False,
     start: options.Start = 0,
@@ -85,6 +85,7 @@ def reconstruct(
     from uni4d_fg.frontend.sequence.naming import order_warnings
     from uni4d_fg.pipeline.asked import check_asked
     from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
+    from uni4d_fg.pipeline.usable_cues import check_given_cues
     from uni4d_fg.pipeline.workers.options import WorkerOptions
 
     began = time.perf_counter()
@@ -94,7 +95,11 @@ def reconstruct(
     settings = load_config(config, [*(changes or ()), *chosen])
     work = None
     if workers is not None or scheduler is not None:
-        work = WorkerOptions(workers, scheduler, time_limit=60.0 * time_limit)
+        work = WorkerOptions(workers, scheduler)
+        if time_limit is not None:
+            work = replace(work, time_limit=60.0 * time_limit)
+    elif time_limit is not None:
+        raise ConfigError("--time-limit is for processes that solve windows: add --window N and --workers N")
     if work is not None and settings.windows.frames is None:
         raise ConfigError("--workers and --scheduler are for the windows of a long video: add --window N")
     if overlap is not None and settings.windows.frames is None:
@@ -110,6 +115,7 @@ def reconstruct(
     plan = source.plan(opened)
     plan.check()
     check_asked(opened.video, settings, samples)
+    check_given_cues(opened.video, settings.input, plan)
     if not (quiet or json):
         for text in order_warnings(opened.video.frame_names):
             typer.echo(f"warning: {text}", err=True)  # before the work: it would all be in vain

@@ -18,7 +18,7 @@ from uni4d_fg.cues.interpolated_depth import GridDepths
 from uni4d_fg.cues.intrinsics import shared_intrinsics
 from uni4d_fg.cues.manifest import save_manifest
 from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_masks, network_tracks
-from uni4d_fg.cues.plan import CuePlan, CueReport
+from uni4d_fg.cues.plan import GUESSED, CuePlan, CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.cues.start_doubts import doubts_of_masks
 from uni4d_fg.errors import ConfigError
@@ -133,13 +133,15 @@ class _Gathering:
                     self.motion_warnings += doubts_of_masks(before, self.cameras_of_motion)
         if plan.keep_built_in_tracks:
             self._any_tracks()
-        if self.intrinsics is None and self.intrinsics_of_motion is None:
-            report.sources["intrinsics"] = "guessed from the image size"
+        guessed = self.intrinsics is None and self.intrinsics_of_motion is None
+        if guessed:
+            report.sources["intrinsics"] = GUESSED
         report.facts += self.motion_facts
         report.warnings[:0] = self.motion_warnings
         sequence = as_sequence(
             replace(
-                self.video, depths=depths, masks=masks, intrinsics=self._best_intrinsics(), tracks=self.tracks,
+                self.video, depths=depths, masks=masks, tracks=self.tracks,
+                intrinsics=None if guessed else self._best_intrinsics(),
                 initial_world_T_cam=self.world_T_cam, content=None, depth_is_metric=report.metric,
                 depth_parallax=self.depth_parallax, focal_sigma=self.focal_sigma,
                 lens=self.video.lens if self.camera is None else self.camera.lens, zoom=self._zoom(),

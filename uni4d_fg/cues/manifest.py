@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from uni4d_fg.cues.cache import FloatMaps
-from uni4d_fg.cues.plan import CuePlan, CueReport
+from uni4d_fg.cues.plan import GUESSED, CuePlan, CueReport
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import atomic_write_json, save_npy
 from uni4d_fg.frontend.sequence.assemble import as_sequence, check_count
@@ -118,7 +118,9 @@ def load_cues(video: Video, folder: Path) -> tuple[Sequence, CueReport]:
             f"{path}: cues of {stored.num_frames} frames of {list(stored.image_size)} px, but {video.name} has "
             f"{video.num_frames} of {list(video.image_size)}; was the video replaced? Make the cues again"
         )
-    changes: dict[str, Any] = {"intrinsics": np.array(stored.intrinsics), "depth_is_metric": stored.report.metric}
+    changes: dict[str, Any] = {"depth_is_metric": stored.report.metric}
+    guessed = stored.report.sources.get("intrinsics") == GUESSED
+    changes["intrinsics"] = None if guessed else np.array(stored.intrinsics)  # the same guess is made of None
     changes["lens"] = Lens(*stored.lens)
     if stored.zoom is not None:
         check_count(path, len(stored.zoom), video.num_frames)

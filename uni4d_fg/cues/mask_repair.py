@@ -28,6 +28,7 @@ from uni4d_fg.cues.mask_distance import (
 from uni4d_fg.cues.mask_flicker import averaged_masks, may_flicker
 from uni4d_fg.frontend.sequence.frames import LazyFrames, where_of
 from uni4d_fg.frontend.sequence.model import FrameSource
+from uni4d_fg.frontend.sequence.problems import some_of
 
 _SPECK = 0.05
 """A mask with less than this part of the area on both sides is missing."""
@@ -170,19 +171,15 @@ def repair_warnings(repaired: RepairedMasks) -> list[str]:
     if frames:
         warnings.append(
             f"masks are missing in {counted(len(frames), 'frame')} between frames that have them, and were made from "
-            f"those beside (input.repair_masks): {_listed(frames)}"
+            f"those beside (input.repair_masks): {some_of(frames, 10)}"
         )
     if repaired.instances:
         warnings.append(
             "masks grow and shrink from frame to frame, and were averaged over the frames beside "
             f"(input.repair_masks): {'instance' if len(repaired.instances) == 1 else 'instances'} "
-            f"{_listed(repaired.instances)}"
+            f"{some_of(repaired.instances, 10)}"
         )
     return warnings
-
-
-def _listed(numbers: list[int]) -> str:
-    return ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
 
 
 def missing_gaps(area: FloatArray) -> list[tuple[int, int]]:

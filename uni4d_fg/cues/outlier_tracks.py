@@ -13,9 +13,8 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray, evenly_spread
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.static_scene import predict_static
-from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.frontend.track_model import LabelledTracks
-from uni4d_fg.geometry.camera import unproject
+from uni4d_fg.geometry.camera import intrinsics_matrix, unproject
 
 
 def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config: MotionMaskConfig) -> BoolArray:

@@ -20,6 +20,9 @@ DepthSource = Literal["given", "card", "geometry"]
 MaskSource = Literal["given", "card", "motion", "none"]
 TrackSource = Literal["given", "card", "built_in"]
 
+GUESSED = "guessed from the image size"
+"""What :attr:`CueReport.sources` says of intrinsics that nobody gave and no motion told."""
+
 
 @dataclass(frozen=True)
 class CueFiles:

@@ -23,6 +23,12 @@ NEAR_PLANE = 0.02
 """Depth in meters below which the inverse depth is continued linearly."""
 
 
+def intrinsics_matrix(intrinsics: FloatArray) -> FloatArray:
+    """Return the (3, 3) matrix of (4,) fx, fy, cx, cy."""
+    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
 def inverse_depth(z: Array, near: float = NEAR_PLANE) -> Array:
     """Return g(z) of the module docstring. Args: ``z`` of any shape, meters. Returns the same shape, 1/m."""
     xp = namespace(z)

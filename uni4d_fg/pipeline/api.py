@@ -20,6 +20,7 @@ from uni4d_fg.optim.added_factors import FactorSource
 from uni4d_fg.pipeline.asked import check_asked
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.run import reconstruct as reconstruct_sequence
+from uni4d_fg.pipeline.usable_cues import check_given_cues
 from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.io import load_reconstruction
@@ -80,12 +81,13 @@ def reconstruct(
         path = Path(source)
         video = open_video(path)
         # What is wrong is said before anything is made.
+        plan = plan_cues(video, bare=path.is_file() or video.depths is None)
         check_asked(video, settings, samples, workers)
+        check_given_cues(video, settings.input, plan)
         read_measurements(measurements or MeasurementFiles(), video.timestamps, settings.measurements)
         if settings.shots.split == "auto" and samples is None and measurements is None:
             frames = ", ".join(str(cut.frame) for cut in find_cuts(video.images, settings.shots))
             warnings = [_CUTS.format(frames=frames)] if frames else []
-        plan = plan_cues(video, bare=path.is_file() or video.depths is None)
         if plan.is_given:
             sequence = as_sequence(replace(video, masks=None) if plan.masks == "none" else video)
         else:

@@ -197,7 +197,7 @@ def _structure_step(
         camera = ["the tracks alone ask for a pinhole that does not zoom"]
     # Stage 2 says so of a pinhole; those of a lens it takes for given.
     bent = not found.camera.lens.is_pinhole and beside_cue is not None
-    moved = focal_warnings(sequence.intrinsics, found.intrinsics[:2]) if bent else []
+    moved = focal_warnings(sequence.given_intrinsics, found.intrinsics[:2]) if bent else []
     summary: dict[str, Any] = {
         "facts": [
             f"{said}, so the tracks alone find the cameras: fx {found.intrinsics[0]:.1f} px, known to "

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from uni4d_fg.allocation import return_free_memory
+from uni4d_fg.allocation import LARGE, return_free_memory
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.measurements.imu import ImuSamples
@@ -26,9 +26,6 @@ from uni4d_fg.pipeline.workers.options import WorkerOptions
 from uni4d_fg.pipeline.written_beside import WrittenBeside
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.run_folder import RunFolder
-
-MUCH = 256 << 20
-"""Bytes; more free memory than this is handed back before a step: the next one has arrays of other sizes."""
 
 
 @dataclass
@@ -76,7 +73,7 @@ class RunInProgress:
                 ),
                 should_stop=self.should_stop,
             )
-            return_free_memory(MUCH)
+            return_free_memory(LARGE)
             record = compute(hooks)
             for kind in kinds_of(name):
                 if kind in self.recorder.solved:

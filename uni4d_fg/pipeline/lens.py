@@ -133,7 +133,7 @@ def lens_step(
     camera = CameraModel(found.intrinsics, found.lens, None if zoom is None else zoom.zoom)
     # A pinhole's move on in bundle adjustment, which has its own look at them; those of a zoom are no single ones.
     alone = not camera.lens.is_pinhole and camera.zoom is None
-    doubts = focal_warnings(sequence.intrinsics, found.intrinsics[:2]) if alone else []
+    doubts = focal_warnings(sequence.given_intrinsics, found.intrinsics[:2]) if alone else []
     summary: dict[str, Any] = {
         "solves": [solve_dict(solve) for solve in found.solves],
         "facts": found.facts(),

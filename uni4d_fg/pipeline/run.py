@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from uni4d_fg.allocation import return_free_memory
+from uni4d_fg.allocation import LARGE, return_free_memory
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
@@ -49,7 +49,7 @@ from uni4d_fg.pipeline.fingerprint import sequence_digest, stage_key
 from uni4d_fg.pipeline.first_cameras import StageInputs, first_cameras
 from uni4d_fg.pipeline.fuse import fuse_depth
 from uni4d_fg.pipeline.graphs import KEPT, GraphValues
-from uni4d_fg.pipeline.in_progress import MUCH, RunInProgress
+from uni4d_fg.pipeline.in_progress import RunInProgress
 from uni4d_fg.pipeline.inertial import metric_cues
 from uni4d_fg.pipeline.joint import NOT_IN_WINDOWS, WITHOUT_IMU, joint_step
 from uni4d_fg.pipeline.leftovers import remove_leftovers
@@ -60,6 +60,7 @@ from uni4d_fg.pipeline.repeats import Repeats
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary
+from uni4d_fg.pipeline.usable_cues import check_given_cues
 from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -129,6 +130,7 @@ def reconstruct(
     """
     check_sequence(sequence)
     check_asked(sequence, config, imu, workers)
+    check_given_cues(sequence, config.input)
     recorder = RecordingRunner(stage_runner(config), KEPT)
     # Threads of BLAS wait for each other in busy loops: on a busy machine small matrices take a thousand times as long.
     # What is worth several threads divides its work itself.
@@ -241,7 +243,7 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
     began = time.perf_counter()
     run.reporter.begin("clouds and pictures", None)
     unit = "m" if summary.cues.get("metric", True) else "scale unknown"
-    return_free_memory(MUCH)
+    return_free_memory(LARGE)
     with ThreadPoolExecutor(1) as beside:
         # Clouds mostly wait for the disk.
         made = beside.submit(GraphValues.of, folder)

@@ -18,6 +18,7 @@ from uni4d_fg.errors import Cancelled, DegenerateProblemError, InputError
 from uni4d_fg.factors.variable_types import INTRINSICS
 from uni4d_fg.frontend.measurements.imu import ImuSamples
 from uni4d_fg.frontend.sequence.model import Sequence, Video
+from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.camera import NEAR_PLANE, seen_from
 from uni4d_fg.optim.added_factors import adding_to
@@ -86,7 +87,7 @@ def camera_init_step(
     if result.bridged_frames:
         summary["warnings"] = [
             f"{len(result.bridged_frames)} frame(s) share too few static tracks with those before and start from "
-            f"constant velocity: {_listed(result.bridged_frames)}"
+            f"constant velocity: {some_of(result.bridged_frames, 10)}"
         ]
     cameras = result.cameras
     arrays = {"world_T_cam": cameras.world_T_cam, "intrinsics": cameras.intrinsics}
@@ -207,8 +208,12 @@ def bundle_summary(
         f"fx {fx:.1f} fy {fy:.1f} px, noise {noise.reprojection_sigma_px:.2f} px, "
         f"depth {100 * noise.depth_sigma:.1f} %"
     ]
+    if sequence.intrinsics_are_guessed:
+        facts.append(
+            f"no intrinsics were given: the focal length started from a guess, {sequence.intrinsics[0]:.0f} px"
+        )
     warnings = scene_warnings(
-        sequence.intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
+        sequence.given_intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
         arrays["intrinsics_covariance"], focal_was_doubted=sequence.focal_sigma is not None,
     )  # fmt: skip
     warnings += unmasked_motion_warnings(
@@ -356,8 +361,3 @@ def stop_if_cancelled(solves: list[SolveSummary], message: str = STOPPED) -> Non
     """Raise what ends a run in which a solve was cancelled."""
     if any(solve.termination is Termination.CANCELLED for solve in solves):
         raise Cancelled(message)
-
-
-def _listed(frames: tuple[int, ...]) -> str:
-    text = ", ".join(str(f) for f in frames[:10])
-    return text + (", ..." if len(frames) > 10 else "")

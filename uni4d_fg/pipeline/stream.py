@@ -27,6 +27,7 @@ from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
 from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
+from uni4d_fg.pipeline.usable_cues import check_given_cues
 from uni4d_fg.pipeline.warnings import scene_warnings
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
@@ -99,6 +100,7 @@ def check_stream(sequence: Sequence, config: Config) -> None:
         ConfigError: If it cannot be solved frame by frame, or asks for a camera model whose parameters are not given.
     """
     check_sequence(sequence)
+    check_given_cues(sequence, config.input)
     check_parameters(sequence, config, "in a stream", "find it with `uni4d-fg reconstruct`")
     if sequence.zoom is not None:
         raise ConfigError("a stream has one focal length, and this camera zooms; use `uni4d-fg reconstruct`")
@@ -216,12 +218,17 @@ def _stream(
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = time.perf_counter() - began
     doubts = scene_warnings(
-        sequence.intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
+        sequence.given_intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
         intrinsics_covariance=reconstruction.intrinsics_covariance,
     )  # fmt: skip
     facts = []
+    if sequence.intrinsics_are_guessed:
+        facts.append(
+            f"no intrinsics were given: the focal length started from a guess, {sequence.intrinsics[0]:.0f} px, and "
+            f"ended at {reconstruction.intrinsics[0]:.0f} px"
+        )
     if closing is not None:
-        seconds["loops"], facts = closing.seconds, closing.facts()
+        seconds["loops"], facts = closing.seconds, [*facts, *closing.facts()]
         doubts += closing.warnings()
     bridged = sum(frame.status is FrameStatus.BRIDGED for frame in finished.frames())
     summary = StreamSummary(

@@ -65,16 +65,21 @@ def unmasked_motion_warnings(
     ]
 
 
-def focal_warnings(given_intrinsics: FloatArray, focal_px: FloatArray) -> list[str]:
-    """Return a sentence if focal lengths (..., 2), px, are far from the given intrinsics (4,)."""
+def focal_warnings(given_intrinsics: FloatArray | None, focal_px: FloatArray) -> list[str]:
+    """Return a sentence if focal lengths (2,), px, are far from the given intrinsics (4,), if any were given."""
+    if given_intrinsics is None:
+        return []
     change = float(np.abs(focal_px / given_intrinsics[:2] - 1.0).max())
     if change <= _MAX_FOCAL_CHANGE:
         return []
-    return [f"the focal lengths moved by {100 * change:.0f} % from the given ones"]
+    return [
+        f"the focal lengths moved by {100 * change:.0f} % from the given ones: {focal_px.mean():.0f} px was found, and "
+        f"{given_intrinsics[:2].mean():.0f} px given"
+    ]
 
 
 def scene_warnings(
-    given_intrinsics: FloatArray,
+    given_intrinsics: FloatArray | None,
     intrinsics: FloatArray,
     world_T_cam: FloatArray,
     landmarks: FloatArray,
@@ -86,7 +91,7 @@ def scene_warnings(
     """Return one sentence for everything that makes a static scene doubtful.
 
     Args:
-        given_intrinsics: (4,) fx, fy, cx, cy, px, that the solve started from.
+        given_intrinsics: (4,) fx, fy, cx, cy, px, that the solve started from; None where that was a guess.
         intrinsics: (4,) that it ended with.
         world_T_cam: (T, 4, 4) poses.
         landmarks: (N, 3) world, meters.

@@ -145,6 +145,10 @@ def test_cues_cannot_be_chosen_inside_a_file(tmp_path: Path) -> None:
     path = write_video(tmp_path / "clip.mp4", gray_frames(3))
     with pytest.raises(InputError, match=r"no masks can be chosen by name; put it into a folder as video\.mp4"):
         open_video(path, masks="deva")
+    with pytest.raises(InputError, match="is a file, and Uni4D's layout is asked for; give the folder"):
+        open_video(path, layout="uni4d")
+    with pytest.raises(InputError, match=r"is a file, and the K\.npy of Uni4D's layout is asked for"):
+        open_video(path, known_intrinsics=True)
     with pytest.raises(InputError, match="a video file brings no depth; put it into a folder"):
         read_sequence(path)
 

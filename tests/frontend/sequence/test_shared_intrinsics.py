@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from uni4d_fg.errors import InputError
-from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix, load_intrinsics
+from uni4d_fg.frontend.sequence.calibration import load_intrinsics
+from uni4d_fg.geometry.camera import intrinsics_matrix
 
 KNOWN = np.array([100.0, 101.0, 8.0, 6.0])
 

@@ -76,9 +76,12 @@ def test_depth_that_is_missing_or_in_the_wrong_unit(tmp_path: Path) -> None:
         ("depth", f"{root / 'depth_cue'}: all depth is missing in frame(s) 1"),
     ]
     np.save(root / "depth.npy", np.full((FRAMES, HEIGHT, WIDTH), 1500.0))
-    assert [m for _, m in said_of(root, "depth", "warning")] == [
-        f"{root / 'depth.npy'}: the median depth is outside 0.05 to 200 m in frame(s) 0, 1, 2, 3"
-    ]
+    outside = f"{root / 'depth.npy'}: the median depth is outside 0.05 to 200 m in frame(s) 0, 1, 2, 3"
+    assert [m for _, m in said_of(root, "depth", "error")] == [outside]
+    used = np.full((FRAMES, HEIGHT, WIDTH), 1500.0)
+    used[:, 0, 0] = 70.0  # within the limits of what is used: it can be reconstructed, as badly as that may be
+    np.save(root / "depth.npy", used)
+    assert [m for _, m in said_of(root, "depth", "warning")] == [outside]
     np.save(root / "depth.npy", np.full((FRAMES, HEIGHT, WIDTH), -np.inf))
     assert [m for _, m in said_of(root, "depth", "error")] == [f"{root / 'depth.npy'}: all depth is missing"]
     sparse = np.zeros((FRAMES, HEIGHT, WIDTH), np.float32)
@@ -97,6 +100,9 @@ def test_masks(tmp_path: Path) -> None:
     assert said(root, "info") == [("masks", f"{root / 'masks'}: all masks are empty: a static video")]
     write_image(root / "masks" / "frame_0002.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     assert said(root, "warning") == [("masks", f"{root / 'masks'}: no pixel is static in frame(s) 1")]
+    for path in sorted((root / "masks").iterdir()):
+        write_image(path, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    assert said(root, "error") == [("masks", f"{root / 'masks'}: no pixel is static in frame(s) 0, 1, 2, 3")]
 
 
 def rename_all(folder: Path, names: list[str]) -> None:

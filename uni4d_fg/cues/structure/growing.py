@@ -18,8 +18,8 @@ from uni4d_fg.cues.structure.two_view import relative_pose
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
-from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import intrinsics_matrix
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.stage import Stage, run_stage

@@ -16,9 +16,8 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.triangulation import median_per_row
+from uni4d_fg.robust import MEDIAN_OF_NORM
 
-_MEDIAN_OF_NORM = 1.1774
-"""Median length of a plane vector with normal components of variance 1."""
 _SETTLED = 0.03
 """Relative change of the limit at which it stays."""
 _WIDEN = 2.0
@@ -66,7 +65,7 @@ def _noise(scene: GrowingScene, error: FloatArray) -> FloatArray:
     """
     seen, frame = _seen(scene, error), scene.observations.frame
     own = median_per_row(error[seen], frame[seen], len(scene.registered))
-    return np.asarray(np.fmax(own, np.median(error[seen])) / _MEDIAN_OF_NORM)
+    return np.asarray(np.fmax(own, np.median(error[seen])) / MEDIAN_OF_NORM)
 
 
 def _disagreeing(scene: GrowingScene, error: FloatArray, limit_px: FloatArray) -> BoolArray:

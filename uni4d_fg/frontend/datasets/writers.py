@@ -18,9 +18,9 @@ from uni4d_fg.files import atomic_path
 from uni4d_fg.frontend.datasets import bonn, kitti, tum
 from uni4d_fg.frontend.datasets.sintel_files import write_cam, write_dpt
 from uni4d_fg.frontend.datasets.tum_files import CALIBRATION
-from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.trajectory_files import continuous_quaternions
+from uni4d_fg.geometry.camera import intrinsics_matrix
 
 _CLOCK_S = 1311868163.0
 """Added to times that start at 0: names of files are seconds of the epoch."""

@@ -228,6 +228,7 @@ def as_sequence(video: Video) -> Sequence:
         depths=video.depths,
         masks=no_masks(size, num_frames) if video.masks is None else video.masks,
         intrinsics=guess_intrinsics(size) if video.intrinsics is None else video.intrinsics,
+        intrinsics_are_guessed=video.intrinsics is None,
         image_size=size,
         timestamps=video.timestamps,
         root=video.root,
@@ -245,8 +246,10 @@ def as_sequence(video: Video) -> Sequence:
 
 
 def as_video(sequence: Sequence) -> Video:
-    """Return a sequence as a video that brings all its cues."""
-    return Video(**{field.name: getattr(sequence, field.name) for field in fields(Sequence)})
+    """Return a sequence as a video that brings all its cues, and intrinsics unless they are guessed."""
+    shared = {field.name for field in fields(Sequence)} & {field.name for field in fields(Video)}
+    values = {name: getattr(sequence, name) for name in shared}
+    return Video(**{**values, "intrinsics": sequence.given_intrinsics})
 
 
 def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:

@@ -9,6 +9,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.files import load_npy
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
+from uni4d_fg.geometry.camera import intrinsics_matrix
 
 MAX_VARIATION = 0.01
 """Per-frame matrices must agree to this part of the focal length (and of the image size, for the center)."""
@@ -25,12 +26,6 @@ def guess_intrinsics(size: tuple[int, int]) -> FloatArray:
     height, width = size
     focal = float(max(size))
     return np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
-
-
-def intrinsics_matrix(intrinsics: FloatArray) -> FloatArray:
-    """Return the (3, 3) matrix of (4,) fx, fy, cx, cy."""
-    fx, fy, cx, cy = (float(v) for v in intrinsics)
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def check_zoom(zoom: FloatArray | None, num_frames: int, where: Path | str) -> None:

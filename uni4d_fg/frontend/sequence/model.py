@@ -158,6 +158,8 @@ class Sequence:
     """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
     focal_sigma: float | None = None
     """Standard deviation of the log focal length where camera motion told the intrinsics; else None."""
+    intrinsics_are_guessed: bool = False
+    """Whether no intrinsics were given, and they are a guess from the size of the images."""
     tracks: Tracks | None = None
     """Long 2D point tracks, when the sequence brings them."""
     lens: Lens = PINHOLE
@@ -167,6 +169,11 @@ class Sequence:
     ground_truth: GroundTruth = field(default_factory=GroundTruth)
     content: Content | None = None
     """What lies between black bars; None where nobody has looked for any."""
+
+    @property
+    def given_intrinsics(self) -> FloatArray | None:
+        """(4,) px that somebody vouches for; None where they are guessed."""
+        return None if self.intrinsics_are_guessed else self.intrinsics
 
     @property
     def num_frames(self) -> int:

@@ -71,6 +71,9 @@ def find_files(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOpti
         raise SequenceProblem(root, "no such folder or file", "check the path")
     if not root.is_dir():
         check_regular(root, "a folder or a video file")
+        if layout == "uni4d" or options.get("known_intrinsics"):
+            asked = "Uni4D's layout" if layout == "uni4d" else "the K.npy of Uni4D's layout"
+            raise SequenceProblem(root, f"is a file, and {asked} is asked for", "give the folder of the sequence")
         return _video_file(root, options)
     name = detect_layout(root, options.get("depth")) if layout == "auto" else layout
     if name == "uni4d":

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence import assemble, naming
 from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, implausible, load_intrinsics
@@ -32,6 +33,8 @@ MAX_TIME_RATIO = 1.5
 """Ratio of the longest to the shortest time between frames that is taken for a constant frame rate."""
 PLAUSIBLE_DEPTH = (0.05, 200.0)
 """Range in meters in which a frame's median depth is expected."""
+_LIMITS = InputConfig()
+"""Of the depth that is used, unless a configuration says otherwise."""
 
 
 def validate_sequence(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOptions]) -> ValidationReport:
@@ -158,9 +161,12 @@ class _Validation:
         missing: list[float] = []
         empty: list[int] = []
         odd: list[int] = []
+        usable: list[int] = []
 
         def visit(frame: int, depth: npt.NDArray[np.float32]) -> None:
             known = depth[np.isfinite(depth)]
+            if ((known >= _LIMITS.min_depth_m) & (known <= _LIMITS.max_depth_m)).any():
+                usable.append(frame)
             missing.append(1.0 - known.size / max(depth.size, 1))
             if not known.size:
                 empty.append(frame)
@@ -178,8 +184,9 @@ class _Validation:
                 "replace these depth maps; the frames are tied by their neighbors only",
             )
         if odd:
+            of_no_use = item == "depth" and not usable
             self.findings.add(
-                "warning",
+                "error" if of_no_use else "warning",
                 item,
                 f"{path}: the median depth is outside {PLAUSIBLE_DEPTH[0]} to {PLAUSIBLE_DEPTH[1]:g} m "
                 f"in frame(s) {some_of(odd)}",
@@ -232,7 +239,7 @@ class _Validation:
             )
         if full:
             self.findings.add(
-                "warning",
+                "error" if len(full) == len(frames) else "warning",
                 "masks",
                 f"{path}: no pixel is static in frame(s) {some_of(full)}",
                 "check that 0 means static; the camera cannot be found from moving things",

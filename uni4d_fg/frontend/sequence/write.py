@@ -14,11 +14,11 @@ import numpy.typing as npt
 from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
 from uni4d_fg.errors import OutputError
 from uni4d_fg.files import atomic_folder, save_npy, save_npz
-from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.frontend.sequence.decode import clean_depth
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
 from uni4d_fg.frontend.sequence.native import DEFAULT_DEPTH, DEPTH_NOTE
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.geometry.camera import intrinsics_matrix
 
 MAX_PNG_DEPTH = 65.0
 """Depth in meters from which on 16-bit millimeters do not reach."""

@@ -19,10 +19,9 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
+from uni4d_fg.robust import MEDIAN_OF_NORM
 
 _MOST_FOLLOWED, _ROUNDS, _DEPTH_ROUNDS, _CUT_OFF, _LEAST_SPREAD_PX = 600, 8, 3, 3.0, 0.2
-_MEDIAN_OF_NORM = 1.1774
-"""Median of the length of a 2D normal vector with unit variance in each component."""
 _TURN, _STEP, _POLYNOMIAL_PX = 0.5, 0.5, 0.5
 """Standard deviations: rotation, rad; translation, in units of the mean depth; coefficients of c."""
 _CORRELATED = 25.0
@@ -155,7 +154,7 @@ def _fit(start: Motion, source: FloatArray, target: FloatArray, known: Known) ->
     motion, depth = start, before.copy()
     for _ in range(_ROUNDS):
         length = np.linalg.norm(target - motion.move(source, depth)[0], axis=1)
-        spread = max(float(np.median(length[likely])) / _MEDIAN_OF_NORM, _LEAST_SPREAD_PX)
+        spread = max(float(np.median(length[likely])) / MEDIAN_OF_NORM, _LEAST_SPREAD_PX)
         residual, _, weight = _residuals(motion, source, target, depth, known, spread)
         by_motion, by_depth = motion.by_motion(source, depth), motion.by_inverse_depth(source, depth)[0]
         weighted = by_motion * weight[:, None, None]

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array
-from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
+from uni4d_fg.geometry.camera import intrinsics_matrix
 from uni4d_fg.optional import import_rerun
 from uni4d_fg.results.colors import instance_colors
 from uni4d_fg.results.export.clouds import moving_cloud, static_cloud

@@ -20,8 +20,8 @@ from scipy.ndimage import distance_transform_edt
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.files import save_npy, save_npz
-from uni4d_fg.frontend.sequence.calibration import intrinsics_matrix
 from uni4d_fg.frontend.sequence.decode import clean_depth
+from uni4d_fg.geometry.camera import intrinsics_matrix
 from uni4d_fg.results.export.clouds import moving_cloud, static_cloud
 from uni4d_fg.results.export.model import ExportJob
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.geometry.camera import intrinsics_matrix
 
 
 def pixel_transfer(
@@ -19,11 +20,6 @@ def pixel_transfer(
         other_intrinsics: (4,) those of the other camera.
         other_T_cam: (4, 4) pose of the camera in the other one's frame.
     """
-    to_pixels = _matrix(other_intrinsics)
-    turn: FloatArray = to_pixels @ other_T_cam[:3, :3] @ np.linalg.inv(_matrix(intrinsics))
+    to_pixels = intrinsics_matrix(other_intrinsics)
+    turn: FloatArray = to_pixels @ other_T_cam[:3, :3] @ np.linalg.inv(intrinsics_matrix(intrinsics))
     return turn, to_pixels @ other_T_cam[:3, 3]
-
-
-def _matrix(intrinsics: FloatArray) -> FloatArray:
-    fx, fy, cx, cy = intrinsics
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

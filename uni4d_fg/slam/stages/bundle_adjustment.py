@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uni4d_fg.allocation import return_free_memory
+from uni4d_fg.allocation import LARGE, return_free_memory
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.solver import NEAR_DAMPING, KernelConfig, SolverConfig
 from uni4d_fg.config.stages import AccelerationConfig, BundleAdjustmentConfig, CameraMotionConfig
@@ -36,7 +36,6 @@ from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknow
 from uni4d_fg.slam.stages.static_covariance import considered_focal_lengths, static_marginals, track_cells
 from uni4d_fg.slam.stages.static_outliers import drop_outliers, landmark_errors, measure_noise, spatial_inliers
 from uni4d_fg.slam.stages.structure import (
-    LARGE,
     depth_prior_terms,
     further_landmarks,
     joined_landmarks,

@@ -33,6 +33,7 @@ from uni4d_fg.geometry.se3 import relative_twist
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.robust import MEDIAN_OF_NORM
 from uni4d_fg.slam.stages.energy import kernel_of
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.rigid_fit import (
@@ -51,8 +52,6 @@ NonRigidSolver = Callable[[Observations], DynamicScene]
 
 _ROUGH_DECREASE = 1e-4
 """Where a fit ends that only tells members from others."""
-_CHI_MEDIAN = 1.1774
-"""Median length of a vector of two unit normals."""
 
 
 @dataclass(frozen=True)
@@ -332,7 +331,7 @@ def _is_member(body: RigidBody, data: BodyObservations, config: RigidObjectsConf
 
 def _noise(fit: _Fit) -> float:
     pixel, _ = data_residuals(fit.body, fit.data)
-    return float(np.median(np.linalg.norm(pixel, axis=1))) / _CHI_MEDIAN
+    return float(np.median(np.linalg.norm(pixel, axis=1))) / MEDIAN_OF_NORM
 
 
 def _rows(names: IntArray, wanted: IntArray) -> IntArray:

@@ -15,12 +15,16 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
+from uni4d_fg.optim.summary import Termination
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, adjust_bundle
 from uni4d_fg.slam.stages.camera_init import CameraInitResult, initialize_cameras
 from uni4d_fg.slam.stages.energy import energy_of
 from uni4d_fg.slam.stages.merging import FindFragments
 from uni4d_fg.slam.stages.observations import Observations, observations_of, weigh_by_drift
 from uni4d_fg.slam.stages.scene import Cameras, StaticScene
+
+_FAR_FOCAL = 0.2
+"""Change of the log focal length in stage 2 from which it is run again: what a smaller one drops is hardly other."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +75,22 @@ class StaticSceneSolver:
             DegenerateProblemError: If no static track can be lifted, or none survives the outlier rules.
             SolverError: If the system is singular or a cue is not finite.
         """
-        return adjust_bundle(
-            self._observations(labelled), start, prior_intrinsics, self.config.bundle_adjustment, freedom,
-            energy_of(self.config), self.hooks, self.run, self.find_fragments, self.timestamps, focal_sigma,
-        )  # fmt: skip
+        observations = self._observations(labelled)
+
+        def adjusted(cameras: Cameras) -> StaticScene:
+            return adjust_bundle(
+                observations, cameras, prior_intrinsics, self.config.bundle_adjustment, freedom,
+                energy_of(self.config), self.hooks, self.run, self.find_fragments, self.timestamps, focal_sigma,
+            )  # fmt: skip
+
+        scene = adjusted(start)
+        change = np.log(scene.cameras.intrinsics[:2] / start.intrinsics[:2])
+        was_cancelled = scene.solves[-1].termination is Termination.CANCELLED
+        if not energy_of(self.config).is_likelihood or was_cancelled or np.abs(change).max() <= _FAR_FOCAL:
+            return scene
+        # The outlier rules judged by a camera that was far off, and what they dropped is not what is wrong.
+        again = adjusted(scene.cameras)
+        return replace(again, solves=[*scene.solves, *again.solves])
 
     def solve(
         self,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uni4d_fg.allocation import return_free_memory
+from uni4d_fg.allocation import LARGE, return_free_memory
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.stages import BundleAdjustmentConfig
 from uni4d_fg.factors.batch import FactorBatch
@@ -27,9 +27,6 @@ from uni4d_fg.slam.stages.lifting import lift, mean_per_row
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise
 from uni4d_fg.slam.stages.static_outliers import drop_outliers, measure_noise, reprojection_residual
-
-LARGE = 256 << 20
-"""Bytes; more free memory than this is handed back before a solve, of which a long video needs as much again."""
 
 
 def reprojection_term(

@@ -1,0 +1,103 @@
+"""Cues from which no camera can be found are refused in one sentence, before anything else is done."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pipeline_scenes import TINY, depth_of, make_config, make_scene, masks_of, with_depth, with_masks
+
+from uni4d_fg.cues.plan import CuePlan
+from uni4d_fg.errors import InputError
+from uni4d_fg.frontend.sequence.assemble import as_sequence, as_video
+from uni4d_fg.frontend.sequence.calibration import guess_intrinsics
+from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.pipeline.stream import stream_sequence
+from uni4d_fg.pipeline.usable_cues import check_given_cues
+
+FREE = make_config().input
+FIXED = make_config("input.intrinsics=fixed").input
+
+
+def scene() -> Sequence:
+    return make_scene(TINY)
+
+
+def in_millimeters(sequence: Sequence) -> Sequence:
+    return with_depth(sequence, 1000.0 * depth_of(sequence))
+
+
+def without_depth(sequence: Sequence) -> Sequence:
+    return with_depth(sequence, np.full_like(depth_of(sequence), np.nan))
+
+
+def all_moving(sequence: Sequence) -> Sequence:
+    return with_masks(sequence, np.ones_like(masks_of(sequence)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (in_millimeters, r"outside 0.05 to 80 m in every frame \(its median is \d+.*check the unit"),
+        (without_depth, "missing everywhere"),
+        (all_moving, "mark every pixel of every frame as moving"),
+    ],
+)
+def test_they_are_refused_before_a_folder_is_made(tmp_path: Path, spoil, said: str) -> None:  # type: ignore[no-untyped-def]
+    for run in (reconstruct, stream_sequence):
+        with pytest.raises(InputError, match=said):
+            run(spoil(scene()), tmp_path / "run", make_config())
+    assert not (tmp_path / "run").exists()
+
+
+def test_one_frame_of_use_is_enough() -> None:
+    depth, masks = depth_of(scene()), np.ones_like(masks_of(scene()))
+    depth[:-1] = np.nan
+    masks[:-1] = 1
+    masks[-1, 0, 0] = 0
+    check_given_cues(with_depth(with_masks(scene(), masks), depth), FREE)
+
+
+def test_cues_that_are_not_used_may_be_of_no_use() -> None:
+    video = as_video(all_moving(in_millimeters(scene())))
+    check_given_cues(video, FREE, CuePlan(depth="card", depth_model="any", masks="motion"))
+    with pytest.raises(InputError, match="mark every pixel"):
+        check_given_cues(video, FREE, CuePlan(depth="card", depth_model="any"))
+    # Cameras that are given need neither.
+    check_given_cues(all_moving(without_depth(scene())), make_config("input.poses=fixed").input)
+
+
+def test_intrinsics_that_are_to_be_kept_must_be_given() -> None:
+    bare = dataclasses.replace(as_video(scene()), intrinsics=None)
+    guessed = as_sequence(bare)
+    assert guessed.intrinsics_are_guessed
+    assert guessed.given_intrinsics is None
+    np.testing.assert_array_equal(guessed.intrinsics, guess_intrinsics(bare.image_size))
+    assert as_video(guessed).intrinsics is None
+    for video in (bare, guessed):
+        check_given_cues(video, FREE)
+        with pytest.raises(InputError, match=r"brings no intrinsics, and input.intrinsics is 'fixed'.*--intrinsics"):
+            check_given_cues(video, FIXED)
+    # A network may tell them, and depth from motion without parallax keeps whatever it was made with.
+    check_given_cues(bare, FIXED, CuePlan(depth="card", depth_model="any"))
+    check_given_cues(dataclasses.replace(guessed, depth_parallax=False), FIXED)
+    check_given_cues(scene(), FIXED)
+
+
+def test_a_guess_is_not_called_given(tmp_path: Path) -> None:
+    guessed = as_sequence(dataclasses.replace(as_video(scene()), intrinsics=None))
+    started = f"no intrinsics were given: the focal length started from a guess, {guessed.intrinsics[0]:.0f} px"
+    batch = reconstruct(guessed, tmp_path / "batch", make_config())
+    assert started in batch.stages["bundle_adjustment"]["facts"]
+    stream = stream_sequence(guessed, tmp_path / "stream", make_config())
+    assert [fact.startswith(started) for fact in stream.facts] == [True]
+    far = dataclasses.replace(scene(), intrinsics=scene().intrinsics * [1.5, 1.5, 1.0, 1.0])
+    given = reconstruct(far, tmp_path / "far", make_config())
+    assert not any("from a guess" in fact for fact in given.stages["bundle_adjustment"]["facts"])
+    assert any(
+        "focal lengths moved by" in text and f"{far.intrinsics[0]:.0f} px given" in text for text in given.warnings
+    )
+    assert not any("focal lengths moved" in text for text in [*batch.warnings, *stream.doubts])
