@@ -54,10 +54,12 @@ def is_sought(sequence: Video | Sequence, config: Config) -> bool:
     """Return whether the lens, or a zoom, is estimated.
 
     That needs the likelihood of energy 'map', Levenberg-Marquardt, and poses and intrinsics that may move. A lens or a
-    zoom that came with the sequence is taken as it is, unless a model is asked for.
+    zoom that came with the sequence is taken as it is, unless a model is asked for, and so is a camera that was found
+    from motion.
     """
     model, zooms = config.camera.model, config.camera.zoom == "on"
-    known = not sequence.lens.is_pinhole or sequence.zoom is not None
+    # Structure from motion has looked for both with the tracks that its depth is made of.
+    known = not sequence.lens.is_pinhole or sequence.zoom is not None or sequence.focal_sigma is not None
     if (model == "pinhole" and not zooms) or (model == "auto" and known):
         return False
     return _rules_it_out(config) is None

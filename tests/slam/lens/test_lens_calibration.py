@@ -169,6 +169,13 @@ def test_a_model_that_is_neither_given_nor_estimated_is_refused(barrel: Sequence
         assert known_camera(plain, config(f"camera.model={model}", change)).lens == PINHOLE
 
 
+def test_a_camera_that_motion_told_is_not_looked_for_again(barrel: Sequence) -> None:
+    of_motion = dataclasses.replace(barrel, lens=PINHOLE, focal_sigma=0.01, depth_parallax=True)
+    assert not is_sought(of_motion, config())
+    assert is_sought(of_motion, config("camera.model=radial"))
+    assert is_sought(dataclasses.replace(of_motion, focal_sigma=None), config())
+
+
 @pytest.mark.slow
 def test_a_small_distortion_needs_held_out_tracks() -> None:
     """Tracks of the built-in tracker on tiny images ask for a lens where there is none."""

@@ -17,6 +17,7 @@ from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import CONVERGED, grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
+from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
@@ -211,7 +212,7 @@ class _Search:
         trim(scene)
         scene.measure_noise()
         scene.adjust(CONVERGED)
-        return _Grown(scene, hypotheses)
+        return _Grown(nearer_to_the_tracks(scene), hypotheses)
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:

@@ -1,0 +1,123 @@
+r"""Near and far exchanged: where a camera turns much and moves little, tracks nearly allow that, the path mirrored.
+
+What a rotation leaves over of the motion of a point with inverse depth q, seen from a camera at c, is about -q c across
+its ray. Of that the rotation takes up what the points have in common, m c with their usual inverse depth m, and the
+rest, -(q - m) c, is the same for
+
+    c' = -c,    q' = 2 m - q.
+
+Perspective tells the two apart, but bundle adjustment does not get from one to the other, and which of them a scene
+begins with is chance where its first cameras see little parallax. So the other one is made of what was found, refined,
+and judged by the same tracks.
+Source: Szeliski and Kang 1997, "Shape ambiguities in structure from motion" (the Necker reversal and its stability).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.growth import CONVERGED
+from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
+from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.errors import SolverError
+
+_NEARLY = 10.0
+"""The reversed scene is refined if it misses the tracks by no more than so many times what the scene itself does."""
+_FARTHEST = 20.0
+"""Of the usual distance: what a reversal takes beyond infinity is put there."""
+_LEAST_POINTS = 6
+_LOST = 100.0
+"""Errors, in sigmas, are cut here."""
+
+
+def nearer_to_the_tracks(scene: GrowingScene) -> GrowingScene:
+    """Return a grown scene, or the one with near and far exchanged where that explains the tracks better.
+
+    Args:
+        scene: Refined.
+
+    Raises:
+        Cancelled: If asked to stop.
+        SolverError: If the system of the scene that is returned cannot be solved.
+    """
+    other = exchanged(scene)
+    if other is None:
+        return scene
+    known = scene.good & np.isfinite(scene.position[scene.row, 0])
+    missed, before = (float(np.median(one.errors()[known])) for one in (other, scene))
+    if not missed <= _NEARLY * before:
+        return scene
+    try:
+        refine(other)
+    except SolverError:
+        return scene
+    sigma = float(scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px)
+    return other if energy(other, sigma) < energy(scene, sigma) else scene
+
+
+def energy(scene: GrowingScene, sigma_px: float) -> float:
+    """Return the mean robust energy of all observations, every track triangulated, at whatever angle its rays meet.
+
+    By how many points a scene has, the one of more parallax would win, be it as wrong as it may. What has no point in
+    front of the cameras counts as lost.
+    """
+    used = scene.registered[scene.observations.frame]
+    seen = scene.observations.select(used)
+    rays = RayBundle(
+        scene.row[used], scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, scene.num_tracks
+    )  # fmt: skip
+    error = triangulate(rays, scene.config.geometric_depth.triangulation_huber_px).errors_of(rays) / sigma_px
+    return float(np.log1p(np.fmin(error, _LOST) ** 2).mean())
+
+
+def refine(scene: GrowingScene) -> None:
+    """Refine a scene whose points and cameras have just been moved, and drop what does not agree with them."""
+    free, scene.free_focal = scene.free_focal, False
+    scene.continue_from(scene)
+    scene.adjust()
+    scene.free_focal = free
+    scene.triangulate_all()
+    scene.adjust()
+    trim(scene)
+    scene.measure_noise()
+    scene.adjust(CONVERGED)
+
+
+def exchanged(scene: GrowingScene) -> GrowingScene | None:
+    """Return a scene with near and far exchanged about the middle of the path, not refined; None without points.
+
+    Cameras turn so that what they see lies in the directions of the new points.
+    """
+    settings = scene.config.geometric_depth
+    frames = np.flatnonzero(scene.registered)
+    center = scene.world_T_cam[frames, :3, 3].mean(axis=0)
+    ray = scene.position - center
+    distance = np.linalg.norm(ray, axis=1)
+    known = np.isfinite(distance) & ~scene.left_out
+    if known.sum() < _LEAST_POINTS:
+        return None
+    usual = float(np.median(1.0 / distance[known]))
+    inverse = np.maximum(2.0 * usual - 1.0 / distance, usual / _FARTHEST)
+    position = center + ray / (distance * inverse)[:, None]
+    poses = scene.world_T_cam.copy()
+    poses[frames, :3, 3] = 2.0 * center - poses[frames, :3, 3]
+    seen, uv = scene.good & np.isfinite(position[scene.row, 0]), scene.observations.uv
+    plane = (uv - scene.intrinsics[2:]) / scene.intrinsics[:2]
+    bearing = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
+    for frame in frames:
+        mine = np.flatnonzero(seen & (scene.observations.frame == frame))
+        if len(mine) < _LEAST_POINTS:
+            continue
+        direction = position[scene.row[mine]] - poses[frame, :3, 3]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        poses[frame, :3, :3] = Rotation.align_vectors(direction, bearing[mine])[0].as_matrix()
+    return replace(
+        scene, world_T_cam=poses, position=position, good=scene.good.copy(), registered=scene.registered.copy(),
+        intrinsics=scene.intrinsics.copy(), left_out=np.zeros_like(scene.left_out),
+        limit_px=np.full_like(scene.limit_px, settings.max_reprojection_px),
+    )  # fmt: skip
