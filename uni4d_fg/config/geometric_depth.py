@@ -33,7 +33,7 @@ class GeometricDepthConfig(Section):
     )
     min_pose_points: int = setting(15, "A frame in which fewer points agree with its pose is bridged instead.", ge=6)
     min_angle_deg: float = setting(
-        1.0, "Points whose rays meet at less than this do not take part in finding cameras, degrees.", gt=0, lt=90
+        0.5, "Points whose rays meet at less than this do not take part in finding cameras, degrees.", gt=0, lt=90
     )
     growth: float = setting(
         1.3, "Bundle adjustment is repeated whenever the number of frames has grown by this factor.", gt=1

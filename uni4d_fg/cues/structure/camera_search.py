@@ -25,6 +25,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.reversal import exchanged_and_refined
 from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.factors.state import State
@@ -216,7 +217,7 @@ def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, confi
 
 
 def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
-    """Fit one radial parameter from the best of several starts, and a second one where that takes energy away."""
+    """Fit a radial lens from the best of several starts, and from there once more with near and far exchanged."""
     starts = []
     for k1 in config.camera.starts:
         camera = CameraModel(plain.camera.intrinsics, Lens("SIMPLE_RADIAL", (k1,)))
@@ -232,6 +233,20 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     for start in starts:
         if found is plain or judge.better(start, found)[0] > 0.0:
             found = start
+    found = _with_lens(found, judge, config)
+    other = exchanged_and_refined(found.scene)
+    if other is None:
+        return found
+    try:
+        mirrored = _with_lens(replace(found, scene=other), judge, config)
+        mirrored = _with_lens(mirrored, judge, config)  # the first one began with the lens of another scene
+    except SolverError:
+        return found
+    return mirrored if judge.better(mirrored, found)[0] > 0.0 else found
+
+
+def _with_lens(found: _Fitted, judge: _Judge, config: Config) -> _Fitted:
+    """Fit one radial parameter, and a second one where that takes energy away."""
     settings = config.camera
     to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
     models: tuple[LensModel, ...] = ("SIMPLE_RADIAL", "RADIAL")

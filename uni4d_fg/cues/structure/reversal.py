@@ -25,7 +25,7 @@ from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
 from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.errors import SolverError
 
-_NEARLY = 10.0
+_NEARLY = 20.0
 """The reversed scene is refined if it misses the tracks by no more than so many times what the scene itself does."""
 _FARTHEST = 20.0
 """Of the usual distance: what a reversal takes beyond infinity is put there."""
@@ -42,21 +42,32 @@ def nearer_to_the_tracks(scene: GrowingScene) -> GrowingScene:
 
     Raises:
         Cancelled: If asked to stop.
-        SolverError: If the system of the scene that is returned cannot be solved.
     """
-    other = exchanged(scene)
+    other = exchanged_and_refined(scene)
     if other is None:
-        return scene
-    known = scene.good & np.isfinite(scene.position[scene.row, 0])
-    missed, before = (float(np.median(one.errors()[known])) for one in (other, scene))
-    if not missed <= _NEARLY * before:
-        return scene
-    try:
-        refine(other)
-    except SolverError:
         return scene
     sigma = float(scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px)
     return other if energy(other, sigma) < energy(scene, sigma) else scene
+
+
+def exchanged_and_refined(scene: GrowingScene) -> GrowingScene | None:
+    """Return a scene with near and far exchanged, refined; None where it misses the tracks by far.
+
+    Raises:
+        Cancelled: If asked to stop.
+    """
+    other = exchanged(scene)
+    if other is None:
+        return None
+    known = scene.good & np.isfinite(scene.position[scene.row, 0])
+    missed, before = (float(np.median(one.errors()[known])) for one in (other, scene))
+    if not missed <= _NEARLY * before:
+        return None
+    try:
+        refine(other)
+    except SolverError:
+        return None
+    return other
 
 
 def energy(scene: GrowingScene, sigma_px: float) -> float:
