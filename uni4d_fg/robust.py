@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+WITHIN_95 = 1.96
+"""So many standard deviations to either side hold 95 % of a normal distribution."""
 MEDIAN_OF_NORM = 1.1774
 """The median length of a plane vector whose two components are normal with standard deviation one: sqrt(2 ln 2)."""
 MAD_TO_SIGMA = 1.4826

@@ -60,7 +60,7 @@ class BlockObjective:
         ]
         self._plan()
         self.is_exact = self.size <= _EXACT_COLUMNS
-        self.parts_of_columns = None if self.is_exact else Parts.of(problem, state, self.columns, self.size)
+        self.parts_of_columns = None if self.is_exact else Parts.of(problem, state, self.columns)
 
     def _plan(self) -> None:
         """Lay J out as CSR: per batch, factor and residual the free entries of every slot."""

@@ -36,7 +36,7 @@ class Parts:
     """Columns of variables that are solved on their own, by number of free entries (n, k)."""
 
     @classmethod
-    def of(cls, problem: Problem, state: State, columns: Mapping[VariableType, IntArray], size: int) -> Parts:
+    def of(cls, problem: Problem, state: State, columns: Mapping[VariableType, IntArray]) -> Parts:
         """Split the columns of a problem."""
         core: list[IntArray] = [np.zeros(0, dtype=np.int64)]
         points: IntArray = np.zeros((0, 3), dtype=np.int64)

@@ -6,14 +6,13 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
+from uni4d_fg.robust import WITHIN_95
 
 _MAX_FOCAL_CHANGE = 0.15
 _MIN_BASELINE = 0.01
 """Of the scene's depth."""
 _MAX_FOCAL_SIGMA = 0.04
 """Standard deviation, as a part of the focal length, above which it counts as poorly determined."""
-_WITHIN = 1.96
-"""So many sigmas hold 95 % of a normal distribution."""
 _MAX_UNCERTAINTY = 0.05
 """Root mean square of the positions' sigmas, of the path's length: a path that may be off by a twentieth of itself."""
 
@@ -131,7 +130,7 @@ def _open_focal(intrinsics: FloatArray, sigma: float) -> list[str]:
         return []
     return [
         f"this video leaves the focal length open: {intrinsics[:2].mean():.0f} px was found, give or take "
-        f"{100 * _WITHIN * sigma:.0f} % (95 %); depth, and motion along the viewing direction, stretch with it; "
+        f"{100 * WITHIN_95 * sigma:.0f} % (95 %); depth, and motion along the viewing direction, stretch with it; "
         "set input.intrinsics=fixed if the given one is known"
     ]
 

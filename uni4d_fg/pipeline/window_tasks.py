@@ -178,11 +178,11 @@ def scene_part(
 class MadeItems(Sequence[ItemT], Generic[ItemT]):
     """Items that are made when they are asked for: the tracks of all windows at once would be all tracks twice."""
 
-    def __init__(self, windows: Sequence[int], make: Callable[[int], ItemT]) -> None:
-        self.windows, self.make = windows, make
+    def __init__(self, numbers: Sequence[int], make: Callable[[int], ItemT]) -> None:
+        self.numbers, self.make = numbers, make
 
     def __len__(self) -> int:
-        return len(self.windows)
+        return len(self.numbers)
 
     @overload
     def __getitem__(self, index: int) -> ItemT: ...
@@ -190,5 +190,5 @@ class MadeItems(Sequence[ItemT], Generic[ItemT]):
     def __getitem__(self, index: slice) -> MadeItems[ItemT]: ...
     def __getitem__(self, index: int | slice) -> ItemT | MadeItems[ItemT]:
         if isinstance(index, slice):
-            return MadeItems(self.windows[index], self.make)
-        return self.make(self.windows[index])
+            return MadeItems(self.numbers[index], self.make)
+        return self.make(self.numbers[index])

@@ -31,6 +31,7 @@ from uni4d_fg.optim.cluster_robust import Clusters, clustered_marginals, image_c
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import Termination
+from uni4d_fg.robust import WITHIN_95
 from uni4d_fg.slam.stages.noise import intraclass_correlation
 
 _CHI2 = 3.841
@@ -110,7 +111,7 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
     if deviation == 0.0:
         return FocalInterval(focal, focal)
     if deviation <= OPEN_FOCAL_SIGMA:  # as far as that E(f) is as good as quadratic
-        ends = focal * np.exp(np.array([-1.96, 1.96]) * deviation)
+        ends = focal * np.exp(np.array([-WITHIN_95, WITHIN_95]) * deviation)
         return FocalInterval(float(ends[0]), float(ends[1]), deviation=deviation)
     profile = _Profile(scene, noise)
     limits = np.log(np.array(scene.config.geometric_depth.usual_focal) * max(image_size) / focal)

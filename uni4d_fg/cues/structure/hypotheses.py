@@ -42,8 +42,6 @@ class Hypothesis:
     """A start that was tried."""
 
     pair: FramePair
-    focal_factor: float
-    """The starting focal length as a part of the given one."""
     tracks: Part
     """Which tracks took part."""
     scene: GrowingScene
@@ -144,7 +142,7 @@ class Competition:
         focal = float(np.mean(scene.intrinsics[:2])) / max(self.image_size)
         is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
         left = unexplained(scene, judged.select(kept_out), self.image_size)
-        return Hypothesis(pair, factor, part, scene, frames, left, is_usual)
+        return Hypothesis(pair, part, scene, frames, left, is_usual)
 
     def _picked(self, frames: IntArray) -> tuple[IntArray, Observations, BoolArray]:
         """Return the observations (n,) that trials on some frames use, in full as well, and which (n,) are held out."""

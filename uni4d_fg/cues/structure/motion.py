@@ -233,7 +233,7 @@ def rotations_only(observations: Observations, num_frames: int, intrinsics: Floa
         a, b = common.between(frame - 1, frame)
         turn = np.eye(3)
         if len(a) >= 3:
-            turn = fit_rotation(observations.uv[a], observations.uv[b], intrinsics).second_R_first
+            turn = fit_rotation(observations.uv[a], observations.uv[b], intrinsics)
         poses[frame, :3, :3] = poses[frame - 1, :3, :3] @ turn.T
     return poses
 

@@ -36,16 +36,6 @@ _CONFIDENCE = 0.9999
 
 
 @dataclass(frozen=True)
-class RotationFit:
-    """The rotation that explains most of the motion between two frames."""
-
-    second_R_first: FloatArray
-    """(3, 3)."""
-    residual_px: float
-    """Median distance that is left."""
-
-
-@dataclass(frozen=True)
 class RelativePose:
     """The second camera seen from the first, with a baseline of length 1."""
 
@@ -55,16 +45,19 @@ class RelativePose:
     """(N,) tracks that agree and lie in front of both cameras."""
 
 
-def fit_rotation(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray) -> RotationFit:
-    """Fit a rotation to N pixel pairs (N, 2), robustly (reweighted towards the median distance).
+def fit_rotation(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray) -> FloatArray:
+    """Return the rotation second_R_first (3, 3) that explains most of the motion of N pixels.
+
+    It is fitted robustly: reweighted towards the median distance.
 
     Args:
         uv_first: (N, 2) px.
         uv_second: (N, 2) px.
         intrinsics: (4,) px.
     """
-    rotation, distance = _fit_rotations(uv_first, uv_second, intrinsics[None])
-    return RotationFit(rotation[0], float(np.median(distance)))
+    rotation, _ = _fit_rotations(uv_first, uv_second, intrinsics[None])
+    first: FloatArray = rotation[0]
+    return first
 
 
 class Parallax(NamedTuple):
