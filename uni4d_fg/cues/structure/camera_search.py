@@ -235,7 +235,8 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
             found = start
     found = _with_lens(found, judge, config)
     other = exchanged_and_refined(found.scene)
-    if other is None:
+    # With a lens that is not its own the right scene explains less, but what it explains it explains better.
+    if other is None or not (other.sigma_px or np.inf) < (found.scene.sigma_px or 0.0):
         return found
     try:
         mirrored = _with_lens(replace(found, scene=other), judge, config)
