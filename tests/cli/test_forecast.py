@@ -140,6 +140,14 @@ def test_given_tracks_say_how_large_bundle_adjustment_is() -> None:
     assert seconds(4000) > 1.5 * seconds(2000)
 
 
+def test_a_lens_is_looked_for_once() -> None:
+    def tasks(plan: CuePlan) -> list[str]:
+        return [share.task for share in expected_shares(60, SIZE, Config(), plan, None)]
+
+    assert tasks(CuePlan()).count("lens") == 1
+    assert tasks(CuePlan(depth="geometry", masks="motion")).count("lens") == 0
+
+
 def test_lines_say_how_long_it_will_take(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     forecast = Forecast([Share("a", 10), Share("b", 30)], clock)

@@ -129,7 +129,7 @@ def test_a_bad_pair_loses_and_an_unusual_focal_length_too(monkeypatch: pytest.Mo
     def trial(pair: FramePair, factor: float, part: Part) -> Hypothesis:
         tried.append((pair, factor))
         is_usual = pair != pairs[2]
-        return Hypothesis(pair, factor, part, scene_of(tracks), np.arange(FRAMES), left[pair], is_usual)
+        return Hypothesis(pair, part, scene_of(tracks), np.arange(FRAMES), left[pair], is_usual)
 
     monkeypatch.setattr(competition, "pairs", lambda _: pairs)
     monkeypatch.setattr(competition, "trial", trial)

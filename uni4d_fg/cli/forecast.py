@@ -211,7 +211,8 @@ def expected_shares(
                 _motion(add)
     known = tracks is not None or not plan.is_given
     shares.append(Share("tracks", 0.05 + 0.02 * size if known else tracking))
-    add("lens", 0.42, 0.016)
+    if not moved:  # of a camera that motion told, structure from motion has found the lens
+        add("lens", 0.42, 0.016)
     add("camera init", 0.15, 0.0)
     if tracks is None:
         add("bundle adjustment", 0.6, 0.16)
