@@ -8,9 +8,8 @@ from cues.start_scenes import GUESS, K, TrackedScene, camera_path, tracked
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.reversal import energy, exchanged, nearer_to_the_tracks
-from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.cues.structure.trimming import trim_and_converge
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 
 FRAMES = 30
@@ -35,9 +34,7 @@ def grown(scene: TrackedScene) -> GrowingScene:
 def settle(scene: GrowingScene) -> None:
     scene.triangulate_all()
     scene.adjust()
-    trim(scene)
-    scene.measure_noise()
-    scene.adjust(CONVERGED)
+    trim_and_converge(scene)
 
 
 def relative_ate(found: GrowingScene, scene: TrackedScene) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,9 @@ def all_moving(sequence: Sequence) -> Sequence:
         (all_moving, "mark every pixel of every frame as moving"),
     ],
 )
-def test_they_are_refused_before_a_folder_is_made(tmp_path: Path, spoil, said: str) -> None:  # type: ignore[no-untyped-def]
+def test_they_are_refused_before_a_folder_is_made(
+    tmp_path: Path, spoil: Callable[[Sequence], Sequence], said: str
+) -> None:
     for run in (reconstruct, stream_sequence):
         with pytest.raises(InputError, match=said):
             run(spoil(scene()), tmp_path / "run", make_config())

@@ -29,7 +29,7 @@ from uni4d_fg.pipeline.inertial import imu_fact, imu_summary
 from uni4d_fg.pipeline.rigid import rigid_objects_part
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
-from uni4d_fg.pipeline.warnings import scene_warnings, unmasked_motion_warnings
+from uni4d_fg.pipeline.warnings import scene_warnings, started_from_a_guess, unmasked_motion_warnings
 from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
 from uni4d_fg.slam.stages.depth_spread import depth_spread
@@ -209,9 +209,7 @@ def bundle_summary(
         f"depth {100 * noise.depth_sigma:.1f} %"
     ]
     if sequence.intrinsics_are_guessed:
-        facts.append(
-            f"no intrinsics were given: the focal length started from a guess, {sequence.intrinsics[0]:.0f} px"
-        )
+        facts.append(started_from_a_guess(sequence.intrinsics))
     warnings = scene_warnings(
         sequence.given_intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
         arrays["intrinsics_covariance"], focal_was_doubted=sequence.focal_sigma is not None,

@@ -28,7 +28,7 @@ from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
 from uni4d_fg.pipeline.usable_cues import check_given_cues
-from uni4d_fg.pipeline.warnings import scene_warnings
+from uni4d_fg.pipeline.warnings import scene_warnings, started_from_a_guess
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
@@ -223,10 +223,8 @@ def _stream(
     )  # fmt: skip
     facts = []
     if sequence.intrinsics_are_guessed:
-        facts.append(
-            f"no intrinsics were given: the focal length started from a guess, {sequence.intrinsics[0]:.0f} px, and "
-            f"ended at {reconstruction.intrinsics[0]:.0f} px"
-        )
+        ended = f"and ended at {reconstruction.intrinsics[0]:.0f} px"
+        facts.append(f"{started_from_a_guess(sequence.intrinsics)}, {ended}")
     if closing is not None:
         seconds["loops"], facts = closing.seconds, [*facts, *closing.facts()]
         doubts += closing.warnings()

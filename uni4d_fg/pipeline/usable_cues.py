@@ -7,6 +7,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array
 from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.cues.plan import CuePlan
+from uni4d_fg.frontend.sequence.frame_checks import usable_depth
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 
@@ -54,7 +55,7 @@ def _check_depth(video: Video | Sequence, config: InputConfig) -> None:
     for frame in range(video.num_frames):
         depth: Float32Array = video.depths[frame]
         known = depth[np.isfinite(depth) & (depth > 0.0)]
-        if ((known >= config.min_depth_m) & (known <= config.max_depth_m)).any():
+        if usable_depth(known, config).any():
             return
         if known.size:
             medians.append(float(np.median(known)))

@@ -64,6 +64,11 @@ def unmasked_motion_warnings(
     ]
 
 
+def started_from_a_guess(guessed_intrinsics: FloatArray) -> str:
+    """Return what a summary says of a solve that started from guessed intrinsics (4,), px."""
+    return f"no intrinsics were given: the focal length started from a guess, {guessed_intrinsics[0]:.0f} px"
+
+
 def focal_warnings(given_intrinsics: FloatArray | None, focal_px: FloatArray) -> list[str]:
     """Return a sentence if focal lengths (2,), px, are far from the given intrinsics (4,), if any were given."""
     if given_intrinsics is None:

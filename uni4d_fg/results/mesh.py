@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, FloatArray, evenly_spread
+from uni4d_fg.arrays import Float32Array, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import OutputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
 from uni4d_fg.geometry.camera import intrinsics_matrix
+from uni4d_fg.geometry.se3 import inverse
 from uni4d_fg.optional import import_open3d
 from uni4d_fg.results.fusion.clouds import depth_edges, dilate
 from uni4d_fg.slam.reconstruction import Reconstruction
@@ -109,7 +110,7 @@ def static_mesh(
             seen = image(core.Tensor(np.where(usable, depth, np.float32(0.0))))
             colors = image(core.Tensor(sequence.images[frame].astype(np.float32) / np.float32(255.0)))
             camera = core.Tensor(intrinsics_matrix(result.frame_intrinsics[frame]))
-            pose_of_world = core.Tensor(_inverse(pose))
+            pose_of_world = core.Tensor(inverse(pose))
             limits = (1.0, volume.farthest_m, _TRUNCATED_AT)  # units per meter, m, voxels
             blocks = field.compute_unique_block_coordinates(seen, camera, pose_of_world, *limits)
             field.integrate(blocks, seen, colors, camera, pose_of_world, *limits)
@@ -117,10 +118,3 @@ def static_mesh(
     mesh = field.extract_triangle_mesh(float(min(_LEAST_FRAMES, len(result.world_T_cam)))).to_legacy()
     mesh.compute_vertex_normals()
     return mesh
-
-
-def _inverse(pose: FloatArray) -> FloatArray:
-    out = np.eye(4)
-    out[:3, :3] = pose[:3, :3].T
-    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return out

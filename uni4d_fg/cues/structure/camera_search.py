@@ -236,7 +236,7 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     found = _with_lens(found, judge, config)
     other = exchanged_and_refined(found.scene)
     # With a lens that is not its own the right scene explains less, but what it explains it explains better.
-    if other is None or not (other.sigma_px or np.inf) < (found.scene.sigma_px or 0.0):
+    if other is None or not other.noise_px < found.scene.noise_px:
         return found
     try:
         mirrored = _with_lens(replace(found, scene=other), judge, config)
@@ -367,8 +367,7 @@ class _Bundle:
     @classmethod
     def of(cls, scene: GrowingScene) -> _Bundle:
         stage, state, frames, _ = scene.bundle()
-        sigma = scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px
-        return cls(stage, state, frames, scene.used()[0], sigma)
+        return cls(stage, state, frames, scene.used()[0], scene.noise_px)
 
     def pixels(self, camera: CameraModel, config: Config) -> RealPixels:
         """Return the observations as a camera has them whose ideal pixels they are at."""

@@ -220,6 +220,11 @@ class GrowingScene:
             state = self._solve(stage, state.replace({INTRINSICS: intrinsics}))
         self._take(state, frames, rows)
 
+    @property
+    def noise_px(self) -> float:
+        """Noise of the tracks that bundle adjustment counts on, px: the measured one, else the configured one."""
+        return self.sigma_px or self.config.bundle_adjustment.reprojection_sigma_px
+
     def used(self) -> tuple[Observations, IntArray]:
         """Return the observations that take part in bundle adjustment, and the track row of each."""
         self._judge()
@@ -247,7 +252,7 @@ class GrowingScene:
         problem = bundle_adjustment_problem(
             state,
             used,
-            StaticNoise(self.sigma_px or settings.reprojection_sigma_px, settings.depth_sigma),
+            StaticNoise(self.noise_px, settings.depth_sigma),
             settings,
             self.prior_intrinsics[None],
             Freedom(poses=True, intrinsics=free_focal),

@@ -15,13 +15,13 @@ from uni4d_fg.cues.structure.epipolar import epipolar_outliers
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval, focal_is_open
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.growth import CONVERGED, grow
+from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
-from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.cues.structure.trimming import trim_and_converge
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.track_model import Tracks
@@ -209,9 +209,7 @@ class _Search:
         )  # fmt: skip
         scene.continue_from(best.scene)
         grow(scene, self.reporter)
-        trim(scene)
-        scene.measure_noise()
-        scene.adjust(CONVERGED)
+        trim_and_converge(scene)
         return _Grown(nearer_to_the_tracks(scene), hypotheses)
 
 

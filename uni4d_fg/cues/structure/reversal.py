@@ -20,9 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
-from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.cues.structure.trimming import trim_and_converge
 from uni4d_fg.errors import SolverError
 
 _NEARLY = 20.0
@@ -46,8 +45,7 @@ def nearer_to_the_tracks(scene: GrowingScene) -> GrowingScene:
     other = exchanged_and_refined(scene)
     if other is None:
         return scene
-    sigma = float(scene.sigma_px or scene.config.bundle_adjustment.reprojection_sigma_px)
-    return other if energy(other, sigma) < energy(scene, sigma) else scene
+    return other if energy(other, scene.noise_px) < energy(scene, scene.noise_px) else scene
 
 
 def exchanged_and_refined(scene: GrowingScene) -> GrowingScene | None:
@@ -88,14 +86,12 @@ def energy(scene: GrowingScene, sigma_px: float) -> float:
 def refine(scene: GrowingScene) -> None:
     """Refine a scene whose points and cameras have just been moved, and drop what does not agree with them."""
     free, scene.free_focal = scene.free_focal, False
-    scene.continue_from(scene)
+    scene.triangulate_all()
     scene.adjust()
     scene.free_focal = free
     scene.triangulate_all()
     scene.adjust()
-    trim(scene)
-    scene.measure_noise()
-    scene.adjust(CONVERGED)
+    trim_and_converge(scene)
 
 
 def exchanged(scene: GrowingScene) -> GrowingScene | None:

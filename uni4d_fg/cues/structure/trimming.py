@@ -15,6 +15,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.triangulation import median_per_row
 from uni4d_fg.robust import MEDIAN_OF_NORM
 
@@ -56,6 +57,18 @@ def trim(scene: GrowingScene) -> None:
         scene.triangulate_all()
     limit = np.minimum(_WIDEN * limit, settings.max_reprojection_px)
     scene.leave_out(_disagreeing(scene, scene.errors(), limit), limit)
+
+
+def trim_and_converge(scene: GrowingScene) -> None:
+    """Trim a grown scene, and refine it with what is left and its noise until it tells a focal length.
+
+    Raises:
+        Cancelled: If asked to stop.
+        SolverError: If bundle adjustment fails.
+    """
+    trim(scene)
+    scene.measure_noise()
+    scene.adjust(CONVERGED)
 
 
 def _noise(scene: GrowingScene, error: FloatArray) -> FloatArray:

@@ -247,8 +247,7 @@ def as_sequence(video: Video) -> Sequence:
 
 def as_video(sequence: Sequence) -> Video:
     """Return a sequence as a video that brings all its cues, and intrinsics unless they are guessed."""
-    shared = {field.name for field in fields(Sequence)} & {field.name for field in fields(Video)}
-    values = {name: getattr(sequence, name) for name in shared}
+    values = {field.name: getattr(sequence, field.name) for field in fields(Video)}
     return Video(**{**values, "intrinsics": sequence.given_intrinsics})
 
 

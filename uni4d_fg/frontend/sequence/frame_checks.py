@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray, Int32Array
+from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.errors import InputError
 
 _MAX_ID = np.iinfo(np.int32).max
@@ -48,6 +49,11 @@ def checked_depth(depth: Any, size: tuple[int, int], where: str) -> Float32Array
         cleaned: Float32Array = array.astype(np.float32)
         cleaned[~((cleaned > 0) & np.isfinite(cleaned))] = np.nan
     return cleaned
+
+
+def usable_depth(depth: npt.NDArray[Any], limits: InputConfig) -> BoolArray:
+    """Return which depths, meters, of any shape, are within the limits; outside they are treated as missing."""
+    return np.asarray((depth >= limits.min_depth_m) & (depth <= limits.max_depth_m))
 
 
 def floating_depth(depth: Any, size: tuple[int, int], where: str) -> npt.NDArray[Any]:

@@ -15,6 +15,7 @@ from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence import assemble, naming
 from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, implausible, load_intrinsics
 from uni4d_fg.frontend.sequence.decode import MIN_16_BIT_RANGE, check_bit_depth, is_16_bit_png
+from uni4d_fg.frontend.sequence.frame_checks import usable_depth
 from uni4d_fg.frontend.sequence.frames import FileFrames, ImageFolder, LazyFrames
 from uni4d_fg.frontend.sequence.layout import IMAGE_SUFFIXES, Layout, LayoutOptions, SequenceFiles, list_frames
 from uni4d_fg.frontend.sequence.poses import load_poses, load_timestamps
@@ -165,7 +166,7 @@ class _Validation:
 
         def visit(frame: int, depth: npt.NDArray[np.float32]) -> None:
             known = depth[np.isfinite(depth)]
-            if ((known >= _LIMITS.min_depth_m) & (known <= _LIMITS.max_depth_m)).any():
+            if usable_depth(known, _LIMITS).any():
                 usable.append(frame)
             missing.append(1.0 - known.size / max(depth.size, 1))
             if not known.size:
