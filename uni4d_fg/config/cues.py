@@ -47,6 +47,11 @@ class TrackingConfig(Section):
     max_refinement_px: float = setting(
         0.5, "The same if the first view is found farther than this from where the step leads, px.", gt=0
     )
+    match_blur: bool = setting(
+        True,
+        "Where the camera turns so fast that an image is blurred along its motion, make first views as blurred before "
+        "they are looked for in it.",
+    )
     bridge_frames: int = setting(
         0,
         "Points that something hides together with those around them are looked for again behind it, for this many "

@@ -41,6 +41,8 @@ class Tracks:
     """(K,) frame in which the track was started, in [0, T)."""
     confidence: Float32Array | None = None
     """(K, T) in [0, 1], when the tracker gives one."""
+    blur_px: Float32Array | None = None
+    """(T,) length of the camera's motion blur in each frame, 0 where sharp, when the tracker tells it."""
 
     def __post_init__(self) -> None:
         k, t = self.visible.shape if self.visible.ndim == 2 else (-1, -1)
@@ -53,6 +55,8 @@ class Tracks:
             raise InputError(f"tracks: visible must be bool, got {self.visible.dtype}")
         if self.confidence is not None and self.confidence.shape != (k, t):
             raise InputError(f"tracks: confidence {self.confidence.shape} must be ({k}, {t})")
+        if self.blur_px is not None and self.blur_px.shape != (t,):
+            raise InputError(f"tracks: blur_px {self.blur_px.shape} must be ({t},)")
         finite = np.isfinite(self.uv[..., 0]) & np.isfinite(self.uv[..., 1])
         if bool((self.visible & ~finite).any()):
             raise InputError("tracks: a visible observation is NaN or infinite; mark it not visible instead")
@@ -70,7 +74,7 @@ class Tracks:
     def select(self, keep: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Tracks:
         """Return the tracks picked by a boolean mask or by indices."""
         confidence = None if self.confidence is None else self.confidence[keep]
-        return Tracks(self.uv[keep], self.visible[keep], self.query_frame[keep], confidence)
+        return Tracks(self.uv[keep], self.visible[keep], self.query_frame[keep], confidence, self.blur_px)
 
 
 @dataclass(frozen=True)

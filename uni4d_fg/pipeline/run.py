@@ -61,6 +61,7 @@ from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, nonrigid_ste
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary
 from uni4d_fg.pipeline.usable_cues import check_given_cues
+from uni4d_fg.pipeline.warnings import blur_warnings
 from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -375,11 +376,17 @@ def _labels(run: RunInProgress, key: str, images: bytes) -> tuple[str, LabelledT
         counts = labelled.counts()
         facts = [", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())]
         facts += bars_note(sequence.content, sequence.image_size)
-        found: dict[str, Any] = {"tracks": counts, "facts": facts}
+        blur = tracks.blur_px
+        if blur is not None and blur.any():
+            facts.append(
+                f"{counted(int((blur > 0).sum()), 'frame')} blurred by up to {blur.max():.0f} px by the camera"
+            )
+        warnings = blur_warnings(blur, config.tracking.patch_px)
+        found: dict[str, Any] = {"tracks": counts, "facts": facts, "warnings": warnings}
         if isinstance(sequence.masks, RepairedMasks):
             repaired = sequence.masks
             found |= {"repaired_masks": repaired.frames, "averaged_masks": repaired.instances}
-            found["warnings"] = repair_warnings(repaired)
+            warnings += repair_warnings(repaired)
             if repaired.frames:
                 facts.append(f"masks of {counted(len(repaired.frames), 'frame')} were made from those beside")
             if repaired.instances:

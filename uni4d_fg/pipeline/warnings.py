@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
+from uni4d_fg.counted import counted
+from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.robust import WITHIN_95
 
@@ -61,6 +63,22 @@ def unmasked_motion_warnings(
     return [
         f"{100 * share:.0f} % of the static tracks lie together and fit no static world: something seems to move, and "
         "no mask covers it; give masks, or have them made from motion (--masks motion)"
+    ]
+
+
+def blur_warnings(blur_px: Float32Array | None, patch_px: int) -> list[str]:
+    """Return a sentence if motion blur (T,), px, is longer than the patches of the tracker anywhere.
+
+    What is smeared over more than a patch has no place in it along the blur: tracks slide there by pixels.
+    """
+    blurred = np.flatnonzero(blur_px > patch_px) if blur_px is not None else np.zeros(0, dtype=np.int64)
+    if blur_px is None or not len(blurred):
+        return []
+    frames = f"{counted(len(blurred), 'frame')} by {patch_px} px and more ({some_of(blurred.tolist())})"
+    return [
+        f"the camera's motion blurs {frames}: "
+        "tracks slide there by pixels, and the path, focal lengths and a lens or zoom that was found may be far off; "
+        "give what of them is known (--intrinsics, camera.model), or leave these frames out (--start, --stop)"
     ]
 
 

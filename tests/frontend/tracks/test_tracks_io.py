@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,16 @@ def test_round_trip(tmp_path: Path, confidence: bool) -> None:
     assert (after.confidence is None) == (not confidence)
     if before.confidence is not None and after.confidence is not None:
         np.testing.assert_array_equal(after.confidence, before.confidence)
+
+
+def test_blur_of_frames_is_kept(tmp_path: Path) -> None:
+    blur = np.array([0.0, 3.5, 12.0, 0.0], np.float32)
+    save_tracks(tmp_path / "tracks.npz", replace(tracks(), blur_px=blur))
+    after = load_tracks(tmp_path / "tracks.npz")
+    np.testing.assert_array_equal(after.blur_px, blur)
+    np.testing.assert_array_equal(after.select(np.array([1, 3])).blur_px, blur)
+    with pytest.raises(InputError, match=r"blur_px \(3,\) must be \(4,\)"):
+        replace(after, blur_px=blur[:3])
 
 
 def test_files_of_other_programs(tmp_path: Path) -> None:

@@ -29,6 +29,11 @@ class FollowedPoints:
     def __post_init__(self) -> None:
         self.views = FirstViews(self.config) if refines(self.config) else None
 
+    @property
+    def blur_px(self) -> float:
+        """Length of the camera's motion blur in the image that the points are in; 0 if it is not looked at."""
+        return 0.0 if self.views is None else float(np.linalg.norm(self.views.blur))
+
     def add(self, image: ImageArray, track: IntArray, points: Float32Array) -> None:
         """Append points (M, 2) px of tracks (M,) that are first seen, or seen again, in an image (H, W) uint8."""
         self.track = np.concatenate((self.track, track))

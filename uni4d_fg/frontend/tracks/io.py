@@ -1,4 +1,4 @@
-"""Track files: ``.npz`` with ``uv``, ``visible``, ``query_frame`` and, if there is one, ``confidence``."""
+"""Track files: ``.npz`` with ``uv``, ``visible``, ``query_frame`` and, where known, ``confidence`` and ``blur_px``."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ def save_tracks(path: Path, tracks: Tracks) -> None:
     arrays = {"uv": tracks.uv, "visible": tracks.visible, "query_frame": tracks.query_frame}
     if tracks.confidence is not None:
         arrays["confidence"] = tracks.confidence
+    if tracks.blur_px is not None:
+        arrays["blur_px"] = tracks.blur_px
     save_npz(path, **arrays)
 
 
@@ -27,12 +29,12 @@ def load_tracks(path: Path) -> Tracks:
     """Read tracks from an ``.npz`` file.
 
     ``uv`` (K, T, 2), ``visible`` (K, T; boolean or 0/1), ``query_frame`` (K,) and optionally ``confidence``
-    (K, T); other arrays are ignored. Positions of observations that are not visible become NaN.
+    (K, T) and ``blur_px`` (T,); other arrays are ignored. Positions of observations that are not visible become NaN.
 
     Raises:
         InputError: If the file is unreadable, lacks an array, or the arrays disagree or are out of range.
     """
-    arrays = load_npz(path, {"uv": 3, "visible": 2, "query_frame": 1}, {"confidence": 2})
+    arrays = load_npz(path, {"uv": 3, "visible": 2, "query_frame": 1}, {"confidence": 2, "blur_px": 1})
     try:
         uv = arrays["uv"].astype(np.float32)
         visible = arrays["visible"].astype(np.bool_)
@@ -40,7 +42,8 @@ def load_tracks(path: Path) -> Tracks:
             uv[~visible] = np.nan
         query_frame = arrays["query_frame"].astype(np.int32)
         confidence = arrays["confidence"].astype(np.float32) if "confidence" in arrays else None
-        tracks = Tracks(uv, visible, query_frame, confidence)
+        blur_px = arrays["blur_px"].astype(np.float32) if "blur_px" in arrays else None
+        tracks = Tracks(uv, visible, query_frame, confidence, blur_px)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     if ((query_frame < 0) | (query_frame >= tracks.num_frames)).any():

@@ -16,7 +16,7 @@ grids, a new point starts (:mod:`uni4d_fg.frontend.tracks.reseeding`), and is fo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -79,6 +79,7 @@ def track_grid(
     grid = query_grid((image_size[0], image_size[1]), config)
     queries: dict[int, _Queries] = {}
     observations: _Observations = []
+    blur_px = np.zeros(num_frames, np.float32)
     steps_done, steps = 0, 2 * (num_frames - 1)
     for forwards in (True, False):
         live = _Sweep(FollowedPoints(config))
@@ -89,6 +90,7 @@ def track_grid(
             image = _gray(images[frame], image_size, frame)
             if previous is not None:
                 live.move(previous, image)
+                blur_px[frame] = max(blur_px[frame], live.followed.blur_px)
                 observations.append((frame, live.followed.track, live.followed.points))
                 steps_done += 1
                 if progress is not None:
@@ -102,7 +104,7 @@ def track_grid(
     query_frame = np.repeat(
         np.arange(num_frames, dtype=np.int32), [len(queries[frame].points) for frame in range(num_frames)]
     )
-    return _assemble(observations, query_frame, num_frames, config.min_observations)
+    return replace(_assemble(observations, query_frame, num_frames, config.min_observations), blur_px=blur_px)
 
 
 @dataclass(frozen=True)

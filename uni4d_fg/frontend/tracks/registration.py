@@ -36,19 +36,42 @@ def cut_templates(image: ImageArray, points: Float32Array, patch_px: int) -> Flo
         points: (N, 2) px.
         patch_px: Side P of the patches, made odd; a template has one more pixel on each side, for gradients.
     """
-    reach = patch_px // 2 + 1
-    height, width = image.shape
-    # One place between four pixels for all of a patch, whose gray levels come in one piece from an image with a frame.
-    last = np.array((width - 1, height - 1), np.float32)
+    levels, whole = cut_levels(image, points, patch_px // 2 + 1)
+    return templates_of(levels, points, whole, image.shape[:2])
+
+
+def cut_levels(image: ImageArray, points: Float32Array, reach: int) -> tuple[ImageArray, Float32Array]:
+    """Return whole pixels (N, 2 reach + 2, 2 reach + 2) around points (N, 2) px, edges repeated beyond the image.
+
+    Returns:
+        The gray levels, and the pixels (N, 2) that are left of and above the middles: those of the points, or the
+        nearest to points outside.
+    """
+    last = np.array((image.shape[1] - 1, image.shape[0] - 1), np.float32)
     whole = np.clip(np.floor(points), 0, last)
+    # One place between four pixels for all of a patch, whose gray levels come in one piece from an image with a frame.
     framed = cv2.copyMakeBorder(image, reach, reach + 1, reach, reach + 1, cv2.BORDER_REPLICATE)
-    side = 2 * reach + 2
     column, row = whole.astype(np.int64).T
-    levels = np.lib.stride_tricks.sliding_window_view(framed, (side, side))[row, column].astype(np.float32)
-    fu, fv = (points - whole)[:, 0, None, None], (points - whole)[:, 1, None, None]
+    return np.lib.stride_tricks.sliding_window_view(framed, (2 * reach + 2,) * 2)[row, column], whole
+
+
+def between_pixels(levels: Float32Array, fraction: Float32Array) -> Float32Array:
+    """Return levels (N, S - 1, S - 1), bilinear, at fractions (N, 2) of a pixel right of and below those (N, S, S)."""
+    fu, fv = fraction[:, 0, None, None], fraction[:, 1, None, None]
     across = levels[:, :, :-1] + fu * (levels[:, :, 1:] - levels[:, :, :-1])
-    templates: Float32Array = across[:, :-1] + fv * (across[:, 1:] - across[:, :-1])
+    between: Float32Array = across[:, :-1] + fv * (across[:, 1:] - across[:, :-1])
+    return between
+
+
+def templates_of(
+    levels: ImageArray, points: Float32Array, whole: Float32Array, image_size: tuple[int, int]
+) -> Float32Array:
+    """Return what :func:`cut_templates` does, from what :func:`cut_levels` returned of an image (height, width)."""
+    height, width = image_size
+    reach = levels.shape[1] // 2 - 1
+    templates = between_pixels(levels.astype(np.float32), points - whole)
     # Few patches leave the image: pixels are looked at in these only.
+    last = np.array((width - 1, height - 1), np.float32)
     rows = np.flatnonzero(((points < reach) | (points > last - reach)).any(axis=1))
     offset = np.arange(-reach, reach + 1, dtype=np.float32)
     u, v = points[rows, :1] + offset, points[rows, 1:] + offset
