@@ -39,6 +39,21 @@ class CameraConfig(Section):
         ge=0,
         le=1,
     )
+    rolling_shutter: float | Literal["off", "auto"] = setting(
+        "off",
+        "Rows that are read one after the other: the time from the first to the last, s (negative: the last one is "
+        "read first); 'auto' finds it where the tracks ask for it; 'off': all at once. Cameras are then those of the "
+        "middle rows.",
+    )
+    readout_axis: Literal["rows", "columns"] = setting(
+        "rows", "What is read one after the other, where that time is given: columns in a video turned on its side."
+    )
+    min_readout_evidence: float = setting(
+        0.03,
+        "Part of the reprojection energy that reading rows one after the other must take away to be taken.",
+        ge=0,
+        lt=1,
+    )
     observations: int = setting(20000, "Observations that the lens is found from, at most.", ge=1000)
     zoom_observations: int = setting(60000, "Observations that a zoom is refined on, at most.", ge=1000)
     frames: int = setting(60, "Frames that the lens is found from, at most.", ge=3)

@@ -97,6 +97,10 @@ def check_camera(sequence: Video | Sequence, config: Config) -> None:
         check_parameters(sequence, config, f"with {has}", f"set {wanted}")
         if config.camera.zoom == "on":
             raise ConfigError(f"camera.zoom=on: with {has} no zoom is estimated; set {wanted}, or camera.zoom=auto")
+        if config.camera.rolling_shutter == "auto":
+            raise ConfigError(
+                f"camera.rolling_shutter=auto: with {has} no readout is estimated; set {wanted}, or give it in seconds"
+            )
 
 
 def check_parameters(sequence: Video | Sequence, config: Config, where: str, remedy: str) -> None:

@@ -57,6 +57,7 @@ from uni4d_fg.pipeline.lens import found_camera, goes_along, is_sought, known_ca
 from uni4d_fg.pipeline.loops import loop_closing, with_loops
 from uni4d_fg.pipeline.measurements import MeasurementFiles, Measurements, read_measurements
 from uni4d_fg.pipeline.repeats import Repeats
+from uni4d_fg.pipeline.shutter import tracks_of_middle_rows
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary
@@ -208,13 +209,14 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
         summary.stages["tracks"]["facts"] = [*summary.stages["tracks"].get("facts", []), repeats.fact()]
         key = stage_key(key, repeats.solved.tolist())
     judging = settings_of_judgment(config, sequence, depth_is_needed=not alone)
-    key, camera = _camera(run, key, solved, solved_tracks, judging)
+    key, still_tracks = tracks_of_middle_rows(run, key, solved, solved_tracks, judging)
+    key, camera = _camera(run, key, solved, still_tracks, judging)
     key, poses = stage_key(key, sequence.focal_sigma), None
     if windows:
-        inputs = StageInputs.of(solved, solved_tracks, camera, config, depth_is_needed=True)
+        inputs = StageInputs.of(solved, still_tracks, camera, config, depth_is_needed=True)
     else:
         first = first_cameras(
-            run, key, solved, solved_tracks, camera, run_stage, is_sought=is_sought(solved, config),
+            run, key, solved, still_tracks, camera, run_stage, is_sought=is_sought(solved, config),
             depth_is_needed=not alone,
         )  # fmt: skip
         camera, inputs, poses, key = first.camera, first.inputs, first.poses, first.key

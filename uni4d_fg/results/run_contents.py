@@ -43,7 +43,8 @@ _KNOWN = {
     "pictures": re.compile(r"(trajectory|depth|scene)\.png"),
     "graphs": re.compile(r"\w+\.(graph\.npz|initial\.values|final\.values)"),
     "stages": re.compile(
-        r"(tracks|lens|camera_init|structure_from_motion|bundle_adjustment|nonrigid|joint|fusion|stream|tracks-[0-9a-f]{32})\.npz"
+        r"(tracks|rolling_shutter|lens|camera_init|structure_from_motion|bundle_adjustment|nonrigid|joint|fusion|stream|"
+        r"tracks-[0-9a-f]{32})\.npz"
     ),
     "stages/windows": re.compile(r"(scene|motion|calibration)_\d{6,}\.npz"),
     "stages/stream": re.compile(r"\d{6,}\.npz"),

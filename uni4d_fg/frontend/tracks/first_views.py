@@ -35,6 +35,8 @@ _GROUP_PX = 2.0
 """Vectors of blur are rounded to multiples of this, so that many first views are blurred at once."""
 _SAMPLE, _LEAST_SAMPLE = 64, 24
 """Points that the length of blur is measured on."""
+_ASTRAY = 0.4
+"""Half of them are nearer to where the motion of all leads than this part of it, or it is not theirs."""
 _CLEARLY = 0.7
 """Of what correlations miss from 1 without blur, blur must leave less than this."""
 _OF_BLUR = 0.1
@@ -221,9 +223,12 @@ class FirstViews:
             return np.zeros(2)
         sharp = np.flatnonzero(~self.patches.blur[self.row].any(axis=1))
         some = sharp[:: max(len(sharp) // _SAMPLE, 1)]
-        moved, found = find(source, target, points[some], points[some] + shift.astype(np.float32), self.config)
+        expected = points[some] + shift.astype(np.float32)
+        moved, found = find(source, target, points[some], expected, self.config)
+        astray = np.linalg.norm(moved - expected, axis=1)[found]
         some, moved = some[found], moved[found]
-        if len(some) < _LEAST_SAMPLE:
+        # What passes before a camera at rest may be what most of two images share, and is no blur of the others.
+        if len(some) < _LEAST_SAMPLE or np.median(astray) > _ASTRAY * np.linalg.norm(shift):
             return np.zeros(2)
 
         def unlike(part: float) -> float:
@@ -236,7 +241,7 @@ class FirstViews:
             return np.zeros(2)
         tried |= {part: unlike(part) for part in others}
         best = min(tried, key=tried.__getitem__)
-        if tried[best] > _CLEARLY * plain:
+        if tried[best] > min(_CLEARLY * plain, 1.0 - self.config.min_patch_correlation):
             return np.zeros(2)
         tried |= {best + change: unlike(best + change) for change in (-_FINER * longest, _FINER * longest)}
         return np.asarray(min(tried, key=tried.__getitem__) * shift)

@@ -102,7 +102,7 @@ def calibrate_lens(
     frames = calibration_frames(TrackSpans.of(labelled), count, settings.frames, config.windows.calibration_sightings)
 
     def chosen(observations: int) -> LabelledTracks:
-        return tracks_in(_thinned(labelled, observations * count // len(frames)), frames).labelled
+        return tracks_in(thinned(labelled, observations * count // len(frames)), frames).labelled
 
     some = chosen(settings.observations)
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0
@@ -178,7 +178,7 @@ def _static(labelled: LabelledTracks) -> BoolArray:
     return np.isin(labelled.label, [int(TrackLabel.STATIC), int(TrackLabel.SHORT_STATIC)])
 
 
-def _thinned(labelled: LabelledTracks, observations: int) -> LabelledTracks:
+def thinned(labelled: LabelledTracks, observations: int) -> LabelledTracks:
     """Keep evenly spread static tracks with about so many observations in all."""
     rows = np.flatnonzero(_static(labelled))
     count = int((labelled.weight[rows] > 0).sum())

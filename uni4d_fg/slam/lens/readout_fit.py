@@ -1,0 +1,156 @@
+"""Whether the images of a video are read row by row, and how fast, from its tracks.
+
+Bundle adjustment of part of the static tracks, moved to where they were at one time
+(:mod:`uni4d_fg.slam.lens.rolling_shutter`), is repeated for several times of readout. Its energy is close to a parabola
+in that time; the part of the reprojection energy that goes away at its minimum is the evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.factors.state import State
+from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
+from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.slam.lens.calibration import thinned
+from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.fit import LensFit, settings_of_fit
+from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout, at_one_time
+from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, near_the_minimum
+from uni4d_fg.slam.stages.scene import StaticScene
+from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
+
+_FIRST, _OUTWARD = 0.3, 2.2
+"""Of the time between two frames: the first readout that is tried, and the factor to the next where it is the best."""
+_LONGEST = 1.0
+"""No image is read longer than until the next."""
+_PARABOLAS, _NEAR = 3, 0.02
+"""Readouts that are nearer than this part of the time between two frames to one that was tried are not."""
+_EXACT_PX = 0.01
+"""Tracks that are explained better than this were computed, or are of frames that are one picture."""
+
+
+@dataclass(frozen=True)
+class FoundReadout:
+    """What was found."""
+
+    readout: Readout | None
+    """None where the tracks do not ask for one."""
+    best: Readout | None = None
+    """The one that explains them best, asked for or not; None where none was sought."""
+    evidence: float = 0.0
+    """Part of the reprojection energy that goes away with it."""
+    solves: list[SolveSummary] = field(default_factory=list)
+
+
+class ReadoutFit:
+    """Compares times of readout on part of the tracks, with outliers as they are judged without one."""
+
+    def __init__(
+        self,
+        labelled: LabelledTracks,
+        timestamps: FloatArray,
+        image_size: tuple[int, int],
+        camera: CameraModel,
+        config: Config,
+        run: StageRunner = run_stage,
+        hooks: Hooks | None = None,
+    ):
+        """Choose the tracks and find cameras with them as they are.
+
+        Args:
+            labelled: All tracks, on real pixels.
+            timestamps: (T,) s.
+            image_size: (height, width), px.
+            camera: Intrinsics, and a lens and a zoom that are known.
+            config: The camera's section and those of stages 1 and 2.
+            run: What solves each declared stage.
+            hooks: Progress and cancellation.
+
+        Raises:
+            DegenerateProblemError: If the cues do not determine the cameras.
+            SolverError: If a system is singular or a cue is not finite.
+        """
+        count = labelled.tracks.num_frames
+        self.timestamps, self.image_size, self.camera = timestamps, image_size, camera
+        self.frames = calibration_frames(
+            TrackSpans.of(labelled), count, config.camera.frames, config.windows.calibration_sightings
+        )
+        self.tracks = thinned(labelled, config.camera.observations * count // len(self.frames))
+        settings = settings_of_fit(config, consecutive=len(self.frames) == int(self.frames[-1]) + 1)
+        stage = settings.bundle_adjustment.model_copy(update={"first_depth_sigma": None})
+        self.fit = LensFit(settings, self._at(None), camera.intrinsics, run, hooks).with_stage(stage)
+        self.scene: StaticScene = self.fit.scene(CameraModel(camera.intrinsics).lens, camera.intrinsics)
+        self._state: State = self.scene.state()
+        self._energies: dict[Readout | None, float] = {}
+        self.reprojection = 1.0
+        """Reprojection energy without a readout, to which evidence is relative."""
+
+    def find(self) -> FoundReadout:
+        """Return the readout that explains the tracks best, and whether they ask for it."""
+        noise = self.scene.noise
+        if noise.reprojection_sigma_px / noise.overstated < _EXACT_PX or len(self.timestamps) < 3:
+            return FoundReadout(None, solves=self.fit.solves)
+        interval = float(np.median(np.diff(self.timestamps)))
+        best = min((self._along(axis, interval) for axis in ("rows", "columns")), key=self.energy)
+        evidence = (self.energy(None) - self.energy(best)) / max(self.reprojection, 1e-300)
+        asked = evidence >= self.fit.config.camera.min_readout_evidence
+        return FoundReadout(best if asked else None, best, evidence, self.fit.solves)
+
+    def energy(self, readout: Readout | None) -> float:
+        """Return the energy that bundle adjustment ends at with a readout, from where the last one ended."""
+        if readout not in self._energies:
+            seen = self.scene.observations
+            uv = self._at(readout).tracks.uv[seen.track, seen.frame].astype(np.float64)
+            ba = self.fit.config.bundle_adjustment
+            problem = bundle_adjustment_problem(
+                self._state, replace(seen, uv=uv), self.scene.noise, ba, self.camera.intrinsics[None],
+                Freedom(poses=True, intrinsics=True), acceleration=self.scene.acceleration,
+            )  # fmt: skip
+            name = "none" if readout is None else f"{readout.axis} {1000 * readout.seconds:.1f} ms"
+            stage = Stage("lens", problem, near_the_minimum(ba.solver), part=f"readout {name}")
+            self._state, summary = self.fit.run(stage, self._state, self.fit.hooks)
+            self.fit.note([summary])
+            self._energies[readout] = summary.final_energy
+            if readout is None:
+                self.reprojection = summary.final_energies["static_reprojection"]
+        return self._energies[readout]
+
+    def _along(self, axis: Axis, interval: float) -> Readout | None:
+        """Return the best readout along an axis, by successive parabolas."""
+        first, end = _FIRST * interval, _LONGEST * interval
+        tried = {0.0: self.energy(None)}
+        tried |= {seconds: self.energy(Readout(seconds, axis)) for seconds in (-first, first)}
+        while True:  # the best so far is to lie between others: outward, as far as a shutter goes
+            best = min(tried, key=tried.__getitem__)
+            if best not in (min(tried), max(tried)) or abs(best) >= end:
+                break
+            farther = float(np.clip(_OUTWARD * best, -end, end))
+            tried[farther] = self.energy(Readout(farther, axis))
+        for _ in range(_PARABOLAS):
+            # Of the best and those beside it: farther ones are no parabola's.
+            at = sorted(tried)
+            middle = int(np.clip(at.index(min(tried, key=tried.__getitem__)), 1, len(at) - 2))
+            beside = at[middle - 1 : middle + 2]
+            curve = np.polyfit(np.array(beside) / interval, [tried[seconds] for seconds in beside], 2)
+            if not curve[0] > 0.0:
+                break
+            lowest = float(np.clip(-0.5 * curve[1] / curve[0] * interval, -end, end))
+            if min(abs(lowest - seconds) for seconds in tried) < _NEAR * interval:
+                break
+            tried[lowest] = self.energy(Readout(lowest, axis))
+        best = min(tried, key=tried.__getitem__)
+        return Readout(best, axis) if best else None
+
+    def _at(self, readout: Readout | None) -> LabelledTracks:
+        """Return the chosen tracks in the chosen frames, with a readout undone, and a lens and a zoom if known."""
+        labelled = self.tracks
+        if readout is not None:
+            labelled = at_one_time(labelled, readout, self.timestamps, self.image_size)
+        return tracks_in(self.camera.ideal_labelled(labelled), self.frames).labelled
