@@ -37,7 +37,7 @@ from uni4d_fg.slam.stages.observations import observations_of
 from uni4d_fg.slam.stages.scene import StaticScene
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
-_EXACT_PX = 0.01
+EXACT_PX = 0.01
 """Tracks that are explained better than this are of frames that are one picture, or were computed."""
 _FAR_BEYOND = 2.0
 """Spread over what counts as poor: through k1 of -0.12 sound cues have 1.7 to 2.4 %, those of networks 8 to 9 %."""
@@ -118,7 +118,7 @@ def calibrate_lens(
     search = LensSearch(fit, believing, some.without(~held_out), settings, image_size)
     pinhole = FittedLens(Lens(), fit.scene(Lens(), intrinsics))
     measured_px = pinhole.scene.noise.reprojection_sigma_px / pinhole.scene.noise.overstated
-    if measured_px < _EXACT_PX and settings.zoom != "on":  # parts of next to nothing say nothing
+    if measured_px < EXACT_PX and settings.zoom != "on":  # parts of next to nothing say nothing
         note = f"a pinhole explains the tracks to {measured_px:.2g} px: nothing is left for a lens or a zoom"
         return LensCalibration(Lens(), intrinsics, [], fit.solves, note)
     left = _left_to_tracks(fit, pinhole.scene, config)

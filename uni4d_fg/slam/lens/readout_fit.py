@@ -1,8 +1,8 @@
 """Whether the images of a video are read row by row, and how fast, from its tracks.
 
 Bundle adjustment of part of the static tracks, moved to where they were at one time
-(:mod:`uni4d_fg.slam.lens.rolling_shutter`), is repeated for several times of readout. Its energy is close to a parabola
-in that time; the part of the reprojection energy that goes away at its minimum is the evidence.
+(:mod:`uni4d_fg.slam.lens.rolling_shutter`), is repeated for several times of readout. Near its minimum its energy is
+close to a parabola in that time; the part of the reprojection energy that goes away at its minimum is the evidence.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
-from uni4d_fg.slam.lens.calibration import thinned
+from uni4d_fg.slam.lens.calibration import EXACT_PX, thinned
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import LensFit, settings_of_fit
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout, at_one_time
@@ -32,8 +32,6 @@ _LONGEST = 1.0
 """No image is read longer than until the next."""
 _PARABOLAS, _NEAR = 3, 0.02
 """Readouts that are nearer than this part of the time between two frames to one that was tried are not."""
-_EXACT_PX = 0.01
-"""Tracks that are explained better than this were computed, or are of frames that are one picture."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class ReadoutFit:
     def find(self) -> FoundReadout:
         """Return the readout that explains the tracks best, and whether they ask for it."""
         noise = self.scene.noise
-        if noise.reprojection_sigma_px / noise.overstated < _EXACT_PX or len(self.timestamps) < 3:
+        if noise.reprojection_sigma_px / noise.overstated < EXACT_PX or len(self.timestamps) < 3:
             return FoundReadout(None, solves=self.fit.solves)
         interval = float(np.median(np.diff(self.timestamps)))
         best = min((self._along(axis, interval) for axis in ("rows", "columns")), key=self.energy)
