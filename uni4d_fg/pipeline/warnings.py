@@ -71,9 +71,9 @@ def blur_warnings(blur_px: Float32Array | None, patch_px: int) -> list[str]:
 
     What is smeared over more than a patch has no place in it along the blur: tracks slide there by pixels.
     """
-    blurred = np.flatnonzero(blur_px > patch_px) if blur_px is not None else np.zeros(0, dtype=np.int64)
-    if blur_px is None or not len(blurred):
+    if blur_px is None or not (blur_px > patch_px).any():
         return []
+    blurred = np.flatnonzero(blur_px > patch_px)
     frames = f"{counted(len(blurred), 'frame')} by {patch_px} px and more ({some_of(blurred.tolist())})"
     return [
         f"the camera's motion blurs {frames}: "

@@ -131,7 +131,9 @@ class FirstViews:
         refined = np.empty_like(points)
         blur = self._blur_of(source, target, points)
         strength = float(np.linalg.norm(blur))
-        self.slack += _OF_BLUR * strength if strength > _STRONG_PX else 0.0
+        is_strong = strength > _STRONG_PX
+        if is_strong:
+            self.slack += _OF_BLUR * strength
 
         def accept(rows: IntArray, moved: Float32Array, expected: Float32Array) -> BoolArray:
             found = np.zeros(len(rows), np.bool_)
@@ -147,7 +149,7 @@ class FirstViews:
             back = rest[comes_back(source, target, points[rows[rest]], moved[rest], expected[rest], self.config)]
             refined[rows[back]] = moved[back]
             # A blurred image makes a poor first view: the old one is kept, for when it ends.
-            anew = back[due[back]] if strength <= _STRONG_PX else back[:0]
+            anew = back[due[back]] if not is_strong else back[:0]
             self.affine[rows[anew]], self.slack[rows[anew]] = _IDENTITY, 0.0
             self.patches.put(self.row[rows[anew]], self._cut(target, moved[anew], blur))
             found[back] = True

@@ -117,7 +117,7 @@ def calibrate_lens(
 
     search = LensSearch(fit, believing, some.without(~held_out), settings, image_size)
     pinhole = FittedLens(Lens(), fit.scene(Lens(), intrinsics))
-    measured_px = pinhole.scene.noise.reprojection_sigma_px / pinhole.scene.noise.overstated
+    measured_px = pinhole.scene.noise.measured_px
     if measured_px < EXACT_PX and settings.zoom != "on":  # parts of next to nothing say nothing
         note = f"a pinhole explains the tracks to {measured_px:.2g} px: nothing is left for a lens or a zoom"
         return LensCalibration(Lens(), intrinsics, [], fit.solves, note)

@@ -15,6 +15,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.factors.state import State
 from uni4d_fg.frontend.track_model import LabelledTracks
+from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
@@ -84,26 +85,24 @@ class ReadoutFit:
         settings = settings_of_fit(config, consecutive=len(self.frames) == int(self.frames[-1]) + 1)
         stage = settings.bundle_adjustment.model_copy(update={"first_depth_sigma": None})
         self.fit = LensFit(settings, self._at(None), camera.intrinsics, run, hooks).with_stage(stage)
-        self.scene: StaticScene = self.fit.scene(CameraModel(camera.intrinsics).lens, camera.intrinsics)
+        self.scene: StaticScene = self.fit.scene(PINHOLE, camera.intrinsics)
         self._state: State = self.scene.state()
-        self._energies: dict[Readout | None, float] = {}
-        self.reprojection = 1.0
-        """Reprojection energy without a readout, to which evidence is relative."""
+        self._solved: dict[Readout | None, SolveSummary] = {}
 
     def find(self) -> FoundReadout:
         """Return the readout that explains the tracks best, and whether they ask for it."""
-        noise = self.scene.noise
-        if noise.reprojection_sigma_px / noise.overstated < EXACT_PX or len(self.timestamps) < 3:
+        if self.scene.noise.measured_px < EXACT_PX or len(self.timestamps) < 3:
             return FoundReadout(None, solves=self.fit.solves)
         interval = float(np.median(np.diff(self.timestamps)))
         best = min((self._along(axis, interval) for axis in ("rows", "columns")), key=self.energy)
-        evidence = (self.energy(None) - self.energy(best)) / max(self.reprojection, 1e-300)
+        reprojection = self._solved[None].final_energies["static_reprojection"]
+        evidence = (self.energy(None) - self.energy(best)) / max(reprojection, 1e-300)
         asked = evidence >= self.fit.config.camera.min_readout_evidence
         return FoundReadout(best if asked else None, best, evidence, self.fit.solves)
 
     def energy(self, readout: Readout | None) -> float:
         """Return the energy that bundle adjustment ends at with a readout, from where the last one ended."""
-        if readout not in self._energies:
+        if readout not in self._solved:
             seen = self.scene.observations
             uv = self._at(readout).tracks.uv[seen.track, seen.frame].astype(np.float64)
             ba = self.fit.config.bundle_adjustment
@@ -115,10 +114,8 @@ class ReadoutFit:
             stage = Stage("lens", problem, near_the_minimum(ba.solver), part=f"readout {name}")
             self._state, summary = self.fit.run(stage, self._state, self.fit.hooks)
             self.fit.note([summary])
-            self._energies[readout] = summary.final_energy
-            if readout is None:
-                self.reprojection = summary.final_energies["static_reprojection"]
-        return self._energies[readout]
+            self._solved[readout] = summary
+        return self._solved[readout].final_energy
 
     def _along(self, axis: Axis, interval: float) -> Readout | None:
         """Return the best readout along an axis, by successive parabolas."""

@@ -66,6 +66,11 @@ class StaticNoise:
     overstated: float = 1.0
     """The reprojection sigma as a multiple of what was measured: above one where that lies below the floor."""
 
+    @property
+    def measured_px(self) -> float:
+        """Reprojection sigma that was measured, px, whatever the floor."""
+        return self.reprojection_sigma_px / self.overstated
+
     def array(self) -> FloatArray:
         """Return it as records hold it, (3,): sigma of reprojection, px, sigma and correlation of the depth cue."""
         return np.array([self.reprojection_sigma_px, self.depth_sigma, self.depth_correlation])
