@@ -8,7 +8,8 @@ from cues.start_scenes import GUESS, K, TrackedScene, camera_path, tracked
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.reversal import energy, exchanged, nearer_to_the_tracks
+from uni4d_fg.cues.structure.judging import robust_energy
+from uni4d_fg.cues.structure.reversal import exchanged, nearer_to_the_tracks
 from uni4d_fg.cues.structure.trimming import trim_and_converge
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 
@@ -59,7 +60,7 @@ def test_the_mirrored_scene_is_a_minimum_that_is_left(seed: int) -> None:
     assert abs(back.intrinsics[0] / K[0] - 1.0) < 0.005
     sigma = true.sigma_px
     assert sigma is not None
-    assert energy(back, sigma) < 0.9 * energy(mirrored, sigma)
+    assert robust_energy(back, sigma) < 0.9 * robust_energy(mirrored, sigma)
 
 
 @pytest.mark.parametrize("turn", [1.2, 0.3])

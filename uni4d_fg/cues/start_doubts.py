@@ -71,9 +71,9 @@ def doubts_of_masks(before: FloatArray, after: FloatArray) -> list[str]:
 
 def _open_focal(structure: Structure, remedy: str) -> list[str]:
     focal = float(np.mean(structure.intrinsics[:2]))
-    below, above = structure.focal.relative(focal)
-    if max(-below, above) <= OPEN_FOCAL:
+    if structure.focal.reach(focal) <= OPEN_FOCAL:
         return []
+    below, above = structure.focal.relative(focal)
     low = "any shorter one" if structure.focal.low_is_open else f"{structure.focal.low:.0f}"
     high = "any longer one" if structure.focal.high_is_open else f"{structure.focal.high:.0f} px"
     return [

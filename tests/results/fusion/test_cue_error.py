@@ -135,6 +135,19 @@ def test_a_constant_cue_before_a_wall_is_named(rng: np.random.Generator) -> None
     assert contradicting_frames(control, FusionConfig()) == [5]
 
 
+def test_a_constant_cue_is_named_where_all_is_about_as_far_and_other_cues_err_by_as_much(
+    rng: np.random.Generator,
+) -> None:
+    control = frames(rng, set())
+    for frame, points in enumerate(control):
+        depth = rng.uniform(3.8, 4.2, 200)
+        cue = np.full(200, 4.0) if frame == 5 else depth * np.exp(0.05 * rng.standard_normal(200))
+        if frame == 7:  # a wall that is seen straight on and nothing else: flat, and right
+            depth, cue = 4.0 * np.exp(0.002 * rng.standard_normal(200)), 4.0 + 1e-4 * np.linspace(-1.0, 1.0, 200)
+        control[frame] = dataclasses.replace(points, cue=cue, log_scale=np.log(depth / cue))
+    assert contradicting_frames(control, FusionConfig()) == [5]
+
+
 def test_samples_that_err_alike_do_not_make_up_a_shift(rng: np.random.Generator) -> None:
     """A smooth error looks like a shift over a small range of depth, and things nearer than that pay for it."""
     error = {np.inf: 0.0, 0.08: 0.0}

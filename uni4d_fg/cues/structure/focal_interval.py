@@ -89,6 +89,11 @@ class FocalInterval:
         """Return by which part the ends are below (negative) and above a focal length."""
         return self.low / focal - 1.0, self.high / focal - 1.0
 
+    def reach(self, focal: float) -> float:
+        """Return the part of a focal length by which the farther end is away from it."""
+        below, above = self.relative(focal)
+        return max(-below, above)
+
     def holding(self, focals: list[float]) -> FocalInterval:
         """Return the interval widened so that it holds other focal lengths, px."""
         low, high = min([self.low, *focals]), max([self.high, *focals])

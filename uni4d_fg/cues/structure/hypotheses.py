@@ -13,7 +13,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.first_pair import FramePair, rank_pairs
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
-from uni4d_fg.cues.structure.judging import held_out, unexplained
+from uni4d_fg.cues.structure.judging import held_out, robust_energy, unexplained
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.progress import SilentReporter
@@ -26,6 +26,8 @@ _UNUSUAL = 0.2
 """What an unusual focal length adds to the unexplained part."""
 _MUCH = 0.25
 """From this part of the tracks on, those that disagree with the majority may be the world."""
+_BETTER = 0.95
+"""Another focal length on the same pair wins with this part of the energy, at most."""
 _OVERLAP = 0.5
 """Pairs that overlap by more than this part of their union are one start."""
 _BESIDE_A_WALL = 2.0
@@ -94,7 +96,7 @@ class Competition:
             factors = [factor for factor in settings.focal_starts if factor != 1.0]
             tried = [self.trial(best.pair, factor, best.tracks) for factor in factors]
             found += [hypothesis for hypothesis in tried if hypothesis is not None]
-        return sorted(found, key=lambda hypothesis: hypothesis.cost)
+        return _settled(sorted(found, key=lambda hypothesis: hypothesis.cost))
 
     def chosen(self, part: Part) -> BoolArray:
         """Return (N,) which observations belong to a part of the tracks."""
@@ -155,6 +157,33 @@ class Competition:
             judged = self.observations.select(chosen)
             self.picked[key] = chosen, judged, held_out(judged, settings.held_out_every)
         return self.picked[key]
+
+
+def _settled(ranked: list[Hypothesis]) -> list[Hypothesis]:
+    """Return the hypotheses with the one first that fits best of those that differ from the first in where f began.
+
+    A minimum beside the right one may have the points of its tracks nearer to the cameras. Then it has more of them,
+    and leaves less unexplained, though what it explains it explains worse. On other frames and tracks energies say
+    nothing of that.
+    """
+    if not ranked:
+        return ranked
+    first = ranked[0]
+    alike = [
+        one
+        for one in ranked
+        if one.pair == first.pair and one.tracks == first.tracks and one.is_usual >= first.is_usual
+    ]
+    if len(alike) < 2:
+        return ranked
+    for one in alike:
+        one.scene.measure_noise()
+    sigma = min(one.scene.noise_px for one in alike)
+    energy = [robust_energy(one.scene, sigma) for one in alike]
+    best = alike[int(np.argmin(energy))]
+    if min(energy) > _BETTER * energy[0]:
+        return ranked
+    return [best, *(one for one in ranked if one is not best)]
 
 
 def trial_frames(pair: FramePair, num_frames: int, steps: int, count: int) -> IntArray:

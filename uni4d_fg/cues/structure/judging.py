@@ -7,8 +7,12 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.selection import picture_cells
+from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.slam.stages.observations import Observations
+
+_LOST = 100.0
+"""Errors, in sigmas, are cut here."""
 
 
 def held_out(observations: Observations, every: int) -> BoolArray:
@@ -37,6 +41,25 @@ def unexplained(scene: GrowingScene, observations: Observations, image_size: tup
     cell = cell + picture_cells(observations.uv, image_size)
     _, row, count = np.unique(cell, return_inverse=True, return_counts=True)
     return float(np.average(np.minimum(error, 1.0) ** 2, weights=1.0 / count[row])) if len(row) else 1.0
+
+
+def robust_energy(scene: GrowingScene, sigma_px: float) -> float:
+    """Return the mean robust energy of a scene's own observations, every track triangulated, however its rays meet.
+
+    By how many points a scene has, the one of more parallax would win, be it as wrong as it may. What has no point in
+    front of the cameras counts as lost.
+
+    Args:
+        scene: Cameras, and tracks.
+        sigma_px: Noise of the tracks; of scenes that are compared, one.
+    """
+    used = scene.registered[scene.observations.frame]
+    seen = scene.observations.select(used)
+    rays = RayBundle(
+        scene.row[used], scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, scene.num_tracks
+    )  # fmt: skip
+    error = triangulate(rays, scene.config.geometric_depth.triangulation_huber_px).errors_of(rays) / sigma_px
+    return float(np.log1p(np.fmin(error, _LOST) ** 2).mean())
 
 
 def errors_of(scene: GrowingScene, observations: Observations) -> FloatArray:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.start_limits import OPEN_FOCAL
 from uni4d_fg.cues.structure.camera_search import find_camera
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
@@ -27,6 +28,7 @@ from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.strength import Strength, strength_of
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -136,8 +138,7 @@ def structure_from_motion(
         if found is not None:
             ideal = found.ideal_observations(observations)
             again = search.grow(ideal, found.intrinsics, free_focal)
-            # Where tracks leave the focal length open, straight forward, they leave distortion open as well.
-            if again is not None and (found.lens.is_pinhole or not focal_is_open(again.scene, image_size)):
+            if again is not None and (found.lens.is_pinhole or search.tells_lens(again, found)):
                 grown, camera, observations = again, found, ideal
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)
@@ -153,8 +154,7 @@ def structure_from_motion(
         rivals = rivals_of(hypotheses, poses)
         focal = focal_interval(scene, image_size)
         if free_focal:
-            usual = np.array(settings.usual_focal) * max(image_size)
-            focal = focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
+            focal = search.holding_rivals(focal, rivals)
             focal_sigma = focal.deviation
         if free_focal and focal.is_wide:
             likely = focal.likely(mean_focal, float(np.mean(intrinsics[:2])), settings.focal_log_sigma)
@@ -211,6 +211,28 @@ class _Search:
         grow(scene, self.reporter)
         trim_and_converge(scene)
         return _Grown(nearer_to_the_tracks(scene), hypotheses)
+
+    def holding_rivals(self, focal: FocalInterval, rivals: list[Rival]) -> FocalInterval:
+        """Return an interval that also holds the focal lengths of other starts, as far as cameras have such ones."""
+        usual = np.array(self.config.geometric_depth.usual_focal) * max(self.image_size)
+        return focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
+
+    def tells_lens(self, grown: _Grown, camera: CameraModel) -> bool:
+        """Tell whether tracks that leave a lens, and a scene grown with it, leave no doubt of the focal length.
+
+        Where they leave the focal length open, as straight forward, they leave distortion open as well. A weak lens is
+        also doubted where starts end at focal lengths so far from each other that a run says so: an error that bends
+        the scene of one of them bends the lens, too.
+        """
+        scene = grown.scene
+        if focal_is_open(scene, self.image_size):
+            return False
+        displacement = camera.lens.displacement(camera.intrinsics, self.image_size)
+        if strength_of(camera.lens, displacement, self.image_size, self.config.camera) is not Strength.WEAK:
+            return True
+        rivals = rivals_of(grown.hypotheses, scene.world_T_cam)
+        focal = float(np.mean(scene.intrinsics[:2]))
+        return self.holding_rivals(FocalInterval(focal, focal), rivals).reach(focal) <= OPEN_FOCAL
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
+from uni4d_fg.cues.structure.judging import robust_energy
 from uni4d_fg.cues.structure.trimming import trim_and_converge
 from uni4d_fg.errors import SolverError
 
@@ -29,8 +29,6 @@ _NEARLY = 20.0
 _FARTHEST = 20.0
 """Of the usual distance: what a reversal takes beyond infinity is put there."""
 _LEAST_POINTS = 6
-_LOST = 100.0
-"""Errors, in sigmas, are cut here."""
 
 
 def nearer_to_the_tracks(scene: GrowingScene) -> GrowingScene:
@@ -45,7 +43,7 @@ def nearer_to_the_tracks(scene: GrowingScene) -> GrowingScene:
     other = exchanged_and_refined(scene)
     if other is None:
         return scene
-    return other if energy(other, scene.noise_px) < energy(scene, scene.noise_px) else scene
+    return other if robust_energy(other, scene.noise_px) < robust_energy(scene, scene.noise_px) else scene
 
 
 def exchanged_and_refined(scene: GrowingScene) -> GrowingScene | None:
@@ -66,21 +64,6 @@ def exchanged_and_refined(scene: GrowingScene) -> GrowingScene | None:
     except SolverError:
         return None
     return other
-
-
-def energy(scene: GrowingScene, sigma_px: float) -> float:
-    """Return the mean robust energy of all observations, every track triangulated, at whatever angle its rays meet.
-
-    By how many points a scene has, the one of more parallax would win, be it as wrong as it may. What has no point in
-    front of the cameras counts as lost.
-    """
-    used = scene.registered[scene.observations.frame]
-    seen = scene.observations.select(used)
-    rays = RayBundle(
-        scene.row[used], scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, scene.num_tracks
-    )  # fmt: skip
-    error = triangulate(rays, scene.config.geometric_depth.triangulation_huber_px).errors_of(rays) / sigma_px
-    return float(np.log1p(np.fmin(error, _LOST) ** 2).mean())
 
 
 def refine(scene: GrowingScene) -> None:

@@ -13,6 +13,12 @@ _LEAST = 7e-4
 _QUANTILES = (0.5, 0.9)
 """Of the errors at a frame's landmarks. Where most are on one wall the median sees no other depth, and finds a constant
 cue as good as any; what stands before the wall tells."""
+_SPREAD = (0.1, 0.9)
+"""Between these quantiles of its log the depth at a frame's landmarks, and the cue there, spread."""
+_FLAT = 0.02
+"""Part of the median frame's spread below which a cue is flat, ..."""
+_DEEP = 0.2
+"""... and above which the landmarks of a frame are not."""
 
 
 def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> list[int]:
@@ -20,7 +26,9 @@ def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> 
 
     Every frame's cue is compared with the landmarks that it sees. A frame is named if what is left is both
     ``broken_ratio`` times what is left in the median frame, and no less than ``broken_share`` of what a constant depth
-    would leave: a cue that still shows which is near and which is far is not broken.
+    would leave: a cue that still shows which is near and which is far is not broken. Where all is about as far a constant
+    depth errs by no more than other cues do. So is named what is flat where landmarks, and the cues of other frames,
+    are not.
 
     Args:
         control: Landmarks of all frames.
@@ -28,6 +36,7 @@ def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> 
     """
     left = np.full((len(_QUANTILES), len(control)), np.nan)
     constant = np.full((len(_QUANTILES), len(control)), np.nan)
+    spread = np.full((2, len(control)), np.nan)
     for frame, points in enumerate(control):
         static = (points.instance == 0) & np.isfinite(points.log_scale) & (points.cue > 0)
         if np.count_nonzero(static) < config.min_control_points:
@@ -37,9 +46,13 @@ def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> 
         a, b, _ = fit_affine(cue, log_z, np.ones(len(log_z)))
         left[:, frame] = np.quantile(np.abs(log_z + np.log(a / cue + b)), _QUANTILES)
         constant[:, frame] = np.quantile(np.abs(log_z - np.median(log_z)), _QUANTILES)
+        low, high = np.quantile([np.log(cue), log_z], _SPREAD, axis=1)
+        spread[:, frame] = high - low
     if np.isfinite(left[0]).sum() < config.min_broken_frames:
         return []
     usual = np.maximum(np.nanmedian(left, axis=1, keepdims=True), _LEAST)
     with np.errstate(invalid="ignore"):
         broken = (left > config.broken_ratio * usual) & (left > config.broken_share * constant)
-    return np.flatnonzero(broken.any(axis=0)).tolist()
+        of_cue, of_scene = spread / np.maximum(np.nanmedian(spread, axis=1, keepdims=True), 1e-300)
+        flat = (of_cue < _FLAT) & (of_scene > _DEEP)
+    return np.flatnonzero(broken.any(axis=0) | flat).tolist()
