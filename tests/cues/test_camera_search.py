@@ -14,6 +14,7 @@ from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.structure import motion
 from uni4d_fg.cues.structure.camera_search import is_lens, similarities
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.cues.structure.rivals import Rival
 from uni4d_fg.cues.track_motion import QuadraticGrid, SharedError
 from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry.camera import project, unproject, world_to_camera
@@ -22,6 +23,7 @@ from uni4d_fg.geometry.se3 import inverse, so3_exp
 from uni4d_fg.progress import SilentReporter
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.sharpness import sharp_frames
 
 FRAMES = 20
 
@@ -130,6 +132,42 @@ def test_a_lens_is_not_believed_where_the_focal_length_is_open(
     found = structure(tracked(path(FRAMES)))
     assert found.focal.is_wide is not is_told
     assert found.camera.lens.is_pinhole is not is_told
+
+
+@pytest.mark.parametrize(("apart", "k1", "is_told"), [(1.1, -0.02, False), (1.04, -0.02, True), (1.1, -0.12, True)])
+def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
+    apart: float, k1: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lens = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
+    monkeypatch.setattr(motion, "find_camera", lambda *_: lens)
+    monkeypatch.setattr(motion, "rivals_of", lambda *_: [Rival(2, 9, apart * K[0], 0.1, 0.2, 0.01)])
+    found = structure(through(tracked(sideways(FRAMES)), lens))
+    assert found.camera.lens.is_pinhole is not is_told
+
+
+def test_frames_that_are_blurred_do_not_tell_a_lens() -> None:
+    """What is found in them errs outward, as through a lens; told that they are blurred, the search leaves them out."""
+    scene = tracked(sideways(FRAMES), noise_px=0.1)
+    seen, blurred = scene.observations, np.arange(FRAMES) % 5 > 2
+    bent = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.04,))).real(seen.uv, seen.frame)
+    uv = np.where(blurred[seen.frame, None], bent, seen.uv)
+    scene = replace(scene, observations=replace(seen, uv=uv))
+    lens = [
+        structure_from_motion(
+            scene.observations, FRAMES, SIZE, GUESS, load_config("default", []), SilentReporter(), lambda: False,
+            any_camera=True, blur_px=blur,
+        )
+        for blur in (None, np.where(blurred, np.float32(9.0), np.float32(0.0)))
+    ]  # fmt: skip
+    told, left_out = (None if found is None else found.camera.lens.model for found in lens)
+    assert (told, left_out) == ("RADIAL", "PINHOLE")
+
+
+def test_sharp_frames() -> None:
+    blur = np.array([0.0, 2.0, 9.0, 0.0], np.float32)
+    np.testing.assert_array_equal(sharp_frames(blur, 4), [True, True, False, True])
+    np.testing.assert_array_equal(sharp_frames(blur + np.float32(5.0), 4), [True] * 4)  # too few are left
+    np.testing.assert_array_equal(sharp_frames(None, 4), [True] * 4)
 
 
 def test_a_camera_that_is_known_is_not_looked_for() -> None:

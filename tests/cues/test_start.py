@@ -129,13 +129,46 @@ def test_a_bad_pair_loses_and_an_unusual_focal_length_too(monkeypatch: pytest.Mo
     def trial(pair: FramePair, factor: float, part: Part) -> Hypothesis:
         tried.append((pair, factor))
         is_usual = pair != pairs[2]
-        return Hypothesis(pair, part, scene_of(tracks), np.arange(FRAMES), left[pair], is_usual)
+        return Hypothesis(pair, part, with_cameras(tracks), np.arange(FRAMES), left[pair], is_usual)
 
     monkeypatch.setattr(competition, "pairs", lambda _: pairs)
     monkeypatch.setattr(competition, "trial", trial)
     assert [h.pair for h in competition.run()] == [pairs[1], pairs[1], pairs[1], pairs[2], pairs[0]]
     # Other focal lengths are tried from the best pair.
     assert tried[3:] == [(pairs[1], 0.75), (pairs[1], 1.4)]
+
+
+def with_cameras(tracks: TrackedScene, turned: float = 0.0) -> GrowingScene:
+    """A scene with the true cameras, every second one turned about the view by a few degrees."""
+    scene = scene_of(tracks, K)
+    scene.registered[:] = True
+    turns = se3.so3_exp(np.radians([[0.0, 0.0, turned * (frame % 2)] for frame in range(FRAMES)]))
+    scene.world_T_cam[:] = tracks.world_T_cam
+    scene.world_T_cam[:, :3, :3] = scene.world_T_cam[:, :3, :3] @ turns
+    scene.triangulate_all()
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("other", "turned", "is_usual", "wins"),
+    [(0, 0.5, True, True), (0, 0.0, True, False), (1, 0.5, True, False), (0, 0.5, False, False)],
+    ids=["explains better", "as well", "on other frames", "with an unusual focal length"],
+)
+def test_of_one_pair_the_start_that_explains_better_what_it_explains_wins(
+    other: int, turned: float, is_usual: bool, wins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though it leaves more unexplained: the one of more parallax has more points, be it as wrong as it may."""
+    tracks = tracked(sideways(FRAMES), 4, points=200)
+    nothing = np.zeros(len(tracks.observations), dtype=bool)
+    competition = Competition(tracks.observations, nothing, FRAMES, SIZE, GUESS, CONFIG, True, lambda: False)
+    pairs = [FramePair(5, 13, 30.0, 200), FramePair(6, 19, 30.0, 100)]
+    first = Hypothesis(pairs[0], "majority", with_cameras(tracks, turned), np.arange(FRAMES), 0.05, True)
+    rival = Hypothesis(pairs[other], "majority", with_cameras(tracks), np.arange(FRAMES), 0.09, is_usual)
+    tried = {(pairs[0], 1.0): first, (pairs[1], 1.0) if other else (pairs[0], 0.75): rival}
+    monkeypatch.setattr(competition, "pairs", lambda _: pairs)
+    monkeypatch.setattr(competition, "trial", lambda pair, factor, _: tried.get((pair, factor)))
+    ranked = competition.run()
+    assert [one.unexplained for one in ranked] == ([0.09, 0.05] if wins else [0.05, 0.09])
 
 
 def test_views_that_fit_badly_are_taken_out_and_posed_again() -> None:

@@ -196,8 +196,9 @@ def test_labels_round_trip(tmp_path: Path, with_confidence: bool) -> None:
     visible = rng.random((4, 6)) < 0.7
     uv = np.where(visible[..., None], rng.random((4, 6, 2)), np.nan).astype(np.float32)
     confidence = rng.random((4, 6)).astype(np.float32) if with_confidence else None
+    blur_px = np.arange(6, dtype=np.float32) if with_confidence else None
     labelled = LabelledTracks(
-        Tracks(uv, visible, np.arange(4, dtype=np.int32), confidence),
+        Tracks(uv, visible, np.arange(4, dtype=np.int32), confidence, blur_px),
         np.array([0, 1, 2, 3], np.int32),
         np.array([0, 5, 0, 0], np.int32),
         visible.astype(np.float32),
@@ -206,7 +207,7 @@ def test_labels_round_trip(tmp_path: Path, with_confidence: bool) -> None:
     path = tmp_path / "labels.npz"
     save_labels(path, labelled)
     again = load_labels(path)
-    for name in ("uv", "visible", "query_frame", "confidence"):
+    for name in ("uv", "visible", "query_frame", "confidence", "blur_px"):
         np.testing.assert_array_equal(getattr(again.tracks, name), getattr(labelled.tracks, name))
     for name in ("label", "instance", "weight", "depth"):
         np.testing.assert_array_equal(getattr(again, name), getattr(labelled, name))

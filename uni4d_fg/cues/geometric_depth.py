@@ -125,7 +125,7 @@ def depth_from_motion(
         )
     structure = structure_from_motion(
         observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop, with_doubts,
-        camera=camera, any_camera=camera is None,
+        camera=camera, any_camera=camera is None, blur_px=tracks.blur_px,
     )  # fmt: skip
     if structure is None:
         ideal = camera or CameraModel(intrinsics)

@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import BoolArray, Float32Array, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, Int32Array, IntArray
 from uni4d_fg.errors import InputError
 
 
@@ -75,6 +75,12 @@ class Tracks:
         """Return the tracks picked by a boolean mask or by indices."""
         confidence = None if self.confidence is None else self.confidence[keep]
         return Tracks(self.uv[keep], self.visible[keep], self.query_frame[keep], confidence, self.blur_px)
+
+    def in_frames(self, frames: IntArray, query_frame: Int32Array) -> Tracks:
+        """Return what is seen in some frames (t,), of tracks that were started in frames (K,), counted among these."""
+        confidence = None if self.confidence is None else self.confidence[:, frames]
+        blur_px = None if self.blur_px is None else self.blur_px[frames]
+        return Tracks(self.uv[:, frames], self.visible[:, frames], query_frame, confidence, blur_px)
 
 
 @dataclass(frozen=True)

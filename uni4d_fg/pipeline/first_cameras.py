@@ -179,6 +179,7 @@ def _structure_step(
             replace(static, weight=np.ones(len(static)), depth=np.full(len(static), np.nan)),
             labelled.tracks.num_frames, sequence.image_size, sequence.intrinsics, config, _Steps(reporter),
             hooks.should_stop or (lambda: False), any_camera=beside_cue is not None, proposed=beside_cue,
+            blur_px=labelled.tracks.blur_px,
         )  # fmt: skip
     except Cancelled as error:
         raise Cancelled(STOPPED) from error

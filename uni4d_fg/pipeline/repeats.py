@@ -11,7 +11,7 @@ from uni4d_fg.arrays import IntArray
 from uni4d_fg.frontend.sequence.frames import SelectedFrames
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.repeats import repeated_frames
-from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
+from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.pipeline.steps import Arrays
 
 _FRAME_FIRST = ("world_T_cam", "log_scale", "pose_covariance")
@@ -62,11 +62,9 @@ class Repeats:
     def labelled(self, labelled: LabelledTracks) -> LabelledTracks:
         """Return labelled tracks of the solved frames."""
         tracks, at = labelled.tracks, self.solved
-        confidence = None if tracks.confidence is None else tracks.confidence[:, at]
-        query = self.shown[tracks.query_frame].astype(np.int32)
         return replace(
             labelled,
-            tracks=Tracks(tracks.uv[:, at], tracks.visible[:, at], query, confidence),
+            tracks=tracks.in_frames(at, self.shown[tracks.query_frame].astype(np.int32)),
             weight=labelled.weight[:, at],
             depth=labelled.depth[:, at],
         )

@@ -20,7 +20,7 @@ def save_labels(path: Path, labelled: LabelledTracks) -> None:
         OutputError: If it cannot be written.
     """
     tracks = labelled.tracks
-    confidence = {} if tracks.confidence is None else {"confidence": tracks.confidence}
+    told = {"confidence": tracks.confidence, "blur_px": tracks.blur_px}
     save_npz(
         path,
         uv=tracks.uv,
@@ -30,7 +30,7 @@ def save_labels(path: Path, labelled: LabelledTracks) -> None:
         instance=labelled.instance,
         weight=labelled.weight,
         depth=labelled.depth,
-        **confidence,
+        **{name: values for name, values in told.items() if values is not None},
     )
 
 
@@ -40,8 +40,8 @@ def load_labels(path: Path) -> LabelledTracks:
     Raises:
         InputError: If the file is missing or damaged, shapes disagree, or a label is unknown.
     """
-    arrays = load_npz(path, _RANKS, {"confidence": 2})
-    confidence = arrays.get("confidence")
+    arrays = load_npz(path, _RANKS, {"confidence": 2, "blur_px": 1})
+    told = {name: arrays[name].astype(np.float32) for name in ("confidence", "blur_px") if name in arrays}
     for name in ("query_frame", "label", "instance"):
         whole = arrays[name].dtype.kind in "iu" and np.array_equal(arrays[name], arrays[name].astype(np.int32))
         if not whole:
@@ -53,7 +53,7 @@ def load_labels(path: Path) -> LabelledTracks:
             arrays["uv"].astype(np.float32),
             arrays["visible"],
             arrays["query_frame"].astype(np.int32),
-            None if confidence is None else confidence.astype(np.float32),
+            **told,
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

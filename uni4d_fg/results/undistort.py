@@ -13,7 +13,7 @@ from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.frames import ChangedFrames
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence
-from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
+from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.results.run import Run
 
@@ -70,7 +70,7 @@ class Undistortion:
         visible = tracks.visible & inside
         uv[~visible] = np.nan
         weight = np.where(visible, labelled.weight, np.float32(0.0))
-        moved = Tracks(uv.astype(np.float32), visible, tracks.query_frame, tracks.confidence)
+        moved = replace(tracks, uv=uv.astype(np.float32), visible=visible)
         return replace(labelled, tracks=moved, weight=weight)
 
 

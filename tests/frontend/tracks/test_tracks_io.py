@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from uni4d_fg.errors import InputError
+from uni4d_fg.frontend.sequence.bars import Content, tracks_inside
+from uni4d_fg.frontend.sequence.resize import resize_tracks
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
 
@@ -31,6 +33,18 @@ def test_round_trip(tmp_path: Path, confidence: bool) -> None:
     assert (after.confidence is None) == (not confidence)
     if before.confidence is not None and after.confidence is not None:
         np.testing.assert_array_equal(after.confidence, before.confidence)
+
+
+def test_what_is_known_of_tracks_and_frames_goes_along_with_them() -> None:
+    before = replace(tracks(confidence=True), blur_px=np.array([0.0, 3.5, 12.0, 0.0], np.float32))
+    some = before.in_frames(np.array([1, 3]), np.zeros(5, np.int32))
+    np.testing.assert_array_equal(some.uv, before.uv[:, [1, 3]])
+    np.testing.assert_array_equal(some.confidence, before.confidence[:, [1, 3]])
+    np.testing.assert_array_equal(some.blur_px, [3.5, 0.0])
+    np.testing.assert_allclose(resize_tracks(before, (60, 80), (30, 40)).blur_px, [0.0, 1.75, 6.0, 0.0])
+    inside = tracks_inside(before, Content(0, 60, 0, 80))
+    np.testing.assert_array_equal(inside.blur_px, before.blur_px)
+    np.testing.assert_array_equal(inside.confidence, before.confidence)
 
 
 def test_blur_of_frames_is_kept(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.cues.structure.first_pair import CommonTracks
@@ -37,6 +37,7 @@ from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.problems import RealPixels, lens_problem, zoom_problem
+from uni4d_fg.slam.lens.sharpness import sharp_frames
 from uni4d_fg.slam.lens.strength import Strength, strength_of
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.observations import Observations
@@ -83,6 +84,7 @@ def find_camera(
     config: Config,
     grown: Grown,
     proposed: CameraModel | None = None,
+    blur_px: Float32Array | None = None,
 ) -> CameraModel | None:
     """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom.
 
@@ -93,13 +95,15 @@ def find_camera(
         config: Section ``camera``: which cameras to look for.
         grown: Grows a scene with another camera.
         proposed: A camera from elsewhere: its zoom, if it has one, is tried whatever the scene asks for.
+        blur_px: (T,) of the frames, where it is known: sharp ones tell the lens.
 
     Raises:
         Cancelled: If asked to stop.
         SolverError: If bundle adjustment fails.
     """
     settings = config.camera
-    part = _part_of(scene, settings.observations)
+    sharp = sharp_frames(blur_px, len(scene.registered))
+    part = _part_of(scene, settings.observations, sharp)
     if not part.good.any():
         return None
     plain = _Fitted(CameraModel(part.intrinsics), part)
@@ -125,10 +129,11 @@ def find_camera(
     return None if best is plain else best.camera
 
 
-def _part_of(scene: GrowingScene, observations: int) -> GrowingScene:
-    """Return the scene with evenly spread tracks that have about so many observations together, in some frames."""
-    seen = scene.observations
-    count = np.bincount(scene.row, minlength=scene.num_tracks)
+def _part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> GrowingScene:
+    """Return the scene with evenly spread tracks that have about so many observations together, in some of (T,)."""
+    seen = scene.observations.select(frames[scene.observations.frame])
+    _, row = seen.rows()
+    count = np.bincount(row)
     last = np.cumsum(count) - 1
     spans = TrackSpans(seen.frame[last - count + 1], seen.frame[last], count)
     chosen = np.zeros(len(scene.registered), dtype=bool)
@@ -297,7 +302,7 @@ def _find_zoom(
         start = grown(camera.ideal_observations(real), camera.intrinsics)
         if start is None:
             return found
-        part = _part_of(start, settings.observations)
+        part = _part_of(start, settings.observations, plain.scene.registered)
         part.free_focal = scene.free_focal
         found = _free_zoom(_Fitted(camera, part), config, to_the_end)
         assert camera.zoom is not None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
 from uni4d_fg.cues.structure.camera_search import find_camera
@@ -90,6 +90,7 @@ def structure_from_motion(
     camera: CameraModel | None = None,
     any_camera: bool = False,
     proposed: CameraModel | None = None,
+    blur_px: Float32Array | None = None,
 ) -> Structure | None:
     """Find cameras and static points from tracks.
 
@@ -105,6 +106,7 @@ def structure_from_motion(
         camera: A lens or a zoom that is known; None for a pinhole.
         any_camera: Also look for a lens and a zoom, as section ``camera`` says, where intrinsics are free.
         proposed: Then also try the zoom of this camera.
+        blur_px: (T,) length of the motion blur of each frame, where it is known: sharp ones tell a lens.
 
     Returns:
         The structure, or None if no two frames have enough parallax to see depth.
@@ -131,6 +133,7 @@ def structure_from_motion(
             found = find_camera(
                 grown.scene, observations, image_size, config,
                 lambda ideal, known: None if (new := quiet.grow(ideal, known, False)) is None else new.scene, proposed,
+                blur_px,
             )  # fmt: skip
         except SolverError:  # That of another camera is no reason to do without this one.
             found = None

@@ -171,7 +171,7 @@ def tracks_inside(tracks: Tracks, content: Content) -> Tracks:
     with np.errstate(invalid="ignore"):
         inside = np.asarray((tracks.uv >= first).all(axis=-1) & (tracks.uv <= last).all(axis=-1))
     uv = np.where(inside[..., None], tracks.uv, np.float32(np.nan))
-    return Tracks(uv, tracks.visible & inside, tracks.query_frame, tracks.confidence)
+    return replace(tracks, uv=uv, visible=tracks.visible & inside)
 
 
 def bars_note(content: Content | None, size: tuple[int, int]) -> list[str]:

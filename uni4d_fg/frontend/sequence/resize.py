@@ -93,4 +93,5 @@ def resize_tracks(tracks: Tracks, size: tuple[int, int], new_size: tuple[int, in
     """
     scale = np.array([new_size[1] / size[1], new_size[0] / size[0]])
     uv = ((tracks.uv + 0.5) * scale - 0.5).astype(np.float32)
-    return Tracks(uv, tracks.visible, tracks.query_frame, tracks.confidence)
+    blur_px = None if tracks.blur_px is None else tracks.blur_px * np.float32(np.sqrt(scale.prod()))
+    return replace(tracks, uv=uv, blur_px=blur_px)

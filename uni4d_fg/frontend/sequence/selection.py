@@ -111,7 +111,5 @@ def _of_poses(poses: FloatArray | None, frames: IntArray) -> FloatArray | None:
 
 
 def _take_of_tracks(tracks: Tracks, frames: IntArray) -> Tracks:
-    confidence = None if tracks.confidence is None else tracks.confidence[:, frames]
     middle = (frames[1:] + frames[:-1]) / 2
-    query_frame = np.searchsorted(middle, tracks.query_frame).astype(np.int32)
-    return Tracks(tracks.uv[:, frames], tracks.visible[:, frames], query_frame, confidence)
+    return tracks.in_frames(frames, np.searchsorted(middle, tracks.query_frame).astype(np.int32))

@@ -8,6 +8,7 @@ Only observations that are visible and away from every object border vote (see
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -124,7 +125,7 @@ def _inside_image(tracks: Tracks, image_size: tuple[int, int]) -> Tracks:
         inside = (u >= -0.5) & (v >= -0.5) & (u < width - 0.5) & (v < height - 0.5)
     visible: BoolArray = tracks.visible & inside
     uv = np.where(visible[..., None], tracks.uv, np.float32(np.nan))
-    return Tracks(uv, visible, tracks.query_frame, tracks.confidence)
+    return replace(tracks, uv=uv, visible=visible)
 
 
 def _nearest_pixel(

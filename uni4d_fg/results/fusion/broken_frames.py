@@ -26,9 +26,9 @@ def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> 
 
     Every frame's cue is compared with the landmarks that it sees. A frame is named if what is left is both
     ``broken_ratio`` times what is left in the median frame, and no less than ``broken_share`` of what a constant depth
-    would leave: a cue that still shows which is near and which is far is not broken. Where all is about as far a constant
-    depth errs by no more than other cues do. So is named what is flat where landmarks, and the cues of other frames,
-    are not.
+    would leave: a cue that still shows which is near and which is far is not broken. Where all is about as far a
+    constant depth errs by no more than other cues do. So what is flat is named, too, where landmarks and the cues of
+    other frames are not.
 
     Args:
         control: Landmarks of all frames.

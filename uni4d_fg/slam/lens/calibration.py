@@ -30,6 +30,7 @@ from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.fit import FittedLens, LensFit, settings_of_fit
 from uni4d_fg.slam.lens.lens_search import LensCandidate, LensSearch, candidate_of
+from uni4d_fg.slam.lens.sharpness import sharp_frames
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
 from uni4d_fg.slam.stages.depth_spread import depth_spread
@@ -100,6 +101,7 @@ def calibrate_lens(
     if not (labelled.weight[_static(labelled)] > 0).any():
         raise DegenerateProblemError("the lens: there is no static track")
     frames = calibration_frames(TrackSpans.of(labelled), count, settings.frames, config.windows.calibration_sightings)
+    frames = frames[sharp_frames(labelled.tracks.blur_px, count)[frames]]
 
     def chosen(observations: int) -> LabelledTracks:
         return tracks_in(thinned(labelled, observations * count // len(frames)), frames).labelled

@@ -9,7 +9,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import ConfigError
-from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
+from uni4d_fg.frontend.track_model import LabelledTracks
 
 _MANY = 5
 """Windows of which one more makes each hardly shorter."""
@@ -89,19 +89,17 @@ class WindowTracks:
 
 
 def tracks_in(labelled: LabelledTracks, frames: IntArray) -> WindowTracks:
-    """Cut out the tracks that have a trusted observation in evenly spaced frames (N,)."""
-    step = int(frames[1] - frames[0]) if len(frames) > 1 else 1
-    part = slice(int(frames[0]), int(frames[-1]) + 1, step)
-    keep = np.flatnonzero((labelled.weight[:, part] > 0).any(axis=1))
-    tracks = labelled.tracks
-    query = np.rint((tracks.query_frame[keep] - frames[0]) / step).astype(np.int32)
-    cut = Tracks(tracks.uv[keep, part], tracks.visible[keep, part], query)
-    return WindowTracks(
-        LabelledTracks(
-            cut, labelled.label[keep], labelled.instance[keep], labelled.weight[keep, part], labelled.depth[keep, part]
-        ),
-        keep,
-    )
+    """Cut out the tracks that have a trusted observation in some frames (N,), ascending.
+
+    The frame in which a track was started, which may be none of these, is counted by their mean spacing.
+    """
+    weight = labelled.weight[:, frames]
+    keep = np.flatnonzero((weight > 0).any(axis=1))
+    tracks = labelled.tracks.select(keep)
+    step = float(np.diff(frames).mean()) if len(frames) > 1 else 1.0
+    cut = tracks.in_frames(frames, np.rint((tracks.query_frame - frames[0]) / step).astype(np.int32))
+    depth = labelled.depth[keep][:, frames]
+    return WindowTracks(LabelledTracks(cut, labelled.label[keep], labelled.instance[keep], weight[keep], depth), keep)
 
 
 @dataclass(frozen=True)
