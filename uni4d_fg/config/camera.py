@@ -96,6 +96,11 @@ class CameraConfig(Section):
         0.1, "Part by which it may explain held-out tracks worse, however far it moves pixels.", ge=0
     )
 
+    @property
+    def has_rolling_shutter(self) -> bool:
+        """Whether rows may be read one after the other."""
+        return self.rolling_shutter not in ("off", 0.0)
+
     @field_validator("starts")
     @classmethod
     def _starts_are_few_and_small(cls, starts: tuple[float, ...]) -> tuple[float, ...]:

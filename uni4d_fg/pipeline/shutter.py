@@ -22,6 +22,7 @@ from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.slam.lens.readout_fit import FoundReadout, ReadoutFit
 from uni4d_fg.slam.lens.rolling_shutter import Readout, at_one_time
+from uni4d_fg.slam.stages.acceleration import frame_interval
 
 _STEP = "rolling_shutter"
 
@@ -35,7 +36,7 @@ def tracks_of_middle_rows(
         Cancelled: If the user interrupts.
     """
     settings = config.camera
-    if settings.rolling_shutter in ("off", 0.0):
+    if not settings.has_rolling_shutter:
         run.forget(_STEP)
         return key, labelled
     key = stage_key(key, settings, config.bundle_adjustment, config.windows.calibration_sightings)
@@ -48,7 +49,7 @@ def tracks_of_middle_rows(
 
 def _step(sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks, run: StageRunner) -> StageRecord:
     settings = config.camera
-    interval = float(np.median(np.diff(sequence.timestamps))) if sequence.num_frames > 1 else np.inf
+    interval = frame_interval(sequence.timestamps) if sequence.num_frames > 1 else np.inf
     if isinstance(settings.rolling_shutter, float):
         given = Readout(settings.rolling_shutter, settings.readout_axis)
         return _record(given, {"facts": [f"{_words(given, interval)}, as given"], "solves": []})

@@ -20,7 +20,7 @@ from typing import cast
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, evenly_spread
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
@@ -28,18 +28,16 @@ from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
-from uni4d_fg.slam.lens.fit import FittedLens, LensFit, settings_of_fit
+from uni4d_fg.slam.lens.fit import FittedLens, LensFit
 from uni4d_fg.slam.lens.lens_search import LensCandidate, LensSearch, candidate_of
+from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample, is_static
 from uni4d_fg.slam.lens.sharpness import sharp_frames
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
 from uni4d_fg.slam.stages.depth_spread import depth_spread
 from uni4d_fg.slam.stages.observations import observations_of
 from uni4d_fg.slam.stages.scene import StaticScene
-from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
-EXACT_PX = 0.01
-"""Tracks that are explained better than this are of frames that are one picture, or were computed."""
 _FAR_BEYOND = 2.0
 """Spread over what counts as poor: through k1 of -0.12 sound cues have 1.7 to 2.4 %, those of networks 8 to 9 %."""
 
@@ -98,17 +96,12 @@ def calibrate_lens(
     """
     settings = config.camera
     count = labelled.tracks.num_frames
-    if not (labelled.weight[_static(labelled)] > 0).any():
+    if not (labelled.weight[is_static(labelled)] > 0).any():
         raise DegenerateProblemError("the lens: there is no static track")
-    frames = calibration_frames(TrackSpans.of(labelled), count, settings.frames, config.windows.calibration_sightings)
-    frames = frames[sharp_frames(labelled.tracks.blur_px, count)[frames]]
-
-    def chosen(observations: int) -> LabelledTracks:
-        return tracks_in(thinned(labelled, observations * count // len(frames)), frames).labelled
-
-    some = chosen(settings.observations)
+    sample = CalibrationSample.of(labelled, config, sharp_frames(labelled.tracks.blur_px, count))
+    some = sample.cut(sample.tracks(settings.observations))
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0
-    config = settings_of_fit(config, consecutive=len(frames) == int(frames[-1]) + 1)
+    config = sample.settings(config)
     believing = LensFit(config, some.without(held_out), intrinsics, run, hooks)
     fit = believing.with_stage(config.bundle_adjustment.model_copy(update={"first_depth_sigma": None}))
     if settings.model not in ("auto", "pinhole"):
@@ -135,7 +128,7 @@ def calibrate_lens(
                 return LensCalibration(found.lens, found.intrinsics, candidates, fit.solves)
     zoom = None
     if settings.zoom != "off":
-        zooming = ZoomFit(fit, frames, chosen(settings.zoom_observations))
+        zooming = ZoomFit(fit, sample.frames, sample.cut(sample.tracks(settings.zoom_observations)))
         zoom = find_zoom(zooming, pinhole.scene, count, settings)
     if settings.model == "pinhole" or (zoom is not None and zoom.zoom is not None):
         # A lens beside a zoom is not sought.
@@ -174,19 +167,3 @@ def _as_model(lens: Lens, model: LensModel) -> Lens:
     """Return a lens of a model to start from: with the parameters of another of its family, else with zeros."""
     same = lens.is_fisheye == (model == "OPENCV_FISHEYE")
     return Lens.of(model, lens.padded if same else np.zeros(4))
-
-
-def _static(labelled: LabelledTracks) -> BoolArray:
-    return np.isin(labelled.label, [int(TrackLabel.STATIC), int(TrackLabel.SHORT_STATIC)])
-
-
-def thinned(labelled: LabelledTracks, observations: int) -> LabelledTracks:
-    """Keep evenly spread static tracks with about so many observations in all."""
-    rows = np.flatnonzero(_static(labelled))
-    count = int((labelled.weight[rows] > 0).sum())
-    if count > observations:
-        rows = rows[evenly_spread(len(rows), max(1, len(rows) * observations // count))]
-    return LabelledTracks(
-        labelled.tracks.select(rows), labelled.label[rows], labelled.instance[rows], labelled.weight[rows],
-        labelled.depth[rows],
-    )  # fmt: skip

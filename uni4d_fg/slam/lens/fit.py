@@ -25,7 +25,6 @@ from uni4d_fg.slam.lens.problems import RealPixels, lens_family, lens_problem
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
-    without_camera_motion,
 )
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.lifting import lift, mean_per_row
@@ -59,16 +58,6 @@ class FittedLens:
     def camera(self) -> CameraModel:
         """Intrinsics, lens and zoom."""
         return CameraModel(self.intrinsics, self.lens, None if self.zoom is None else np.exp(self.zoom))
-
-
-def settings_of_fit(config: Config, *, consecutive: bool) -> Config:
-    """Return the configuration of stages 1 and 2 for fits: cameras only, E_cam only between consecutive frames.
-
-    All tracks take part, alike: those that one model explains badly are what another is to be asked for.
-    """
-    changes = {"structure": "keep", "covariance_cells": 0, "trim_sigmas": None, "track_noise_dof": None}
-    stage = config.bundle_adjustment.model_copy(update=changes)
-    return config.model_copy(update={"bundle_adjustment": stage if consecutive else without_camera_motion(stage)})
 
 
 @dataclass

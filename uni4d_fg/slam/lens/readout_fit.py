@@ -19,13 +19,13 @@ from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
-from uni4d_fg.slam.lens.calibration import EXACT_PX, thinned
 from uni4d_fg.slam.lens.camera_model import CameraModel
-from uni4d_fg.slam.lens.fit import LensFit, settings_of_fit
+from uni4d_fg.slam.lens.fit import LensFit
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout, at_one_time
+from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample
+from uni4d_fg.slam.stages.acceleration import frame_interval
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, near_the_minimum
 from uni4d_fg.slam.stages.scene import StaticScene
-from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
 
 _FIRST, _OUTWARD = 0.3, 2.2
 """Of the time between two frames: the first readout that is tried, and the factor to the next where it is the best."""
@@ -76,13 +76,10 @@ class ReadoutFit:
             DegenerateProblemError: If the cues do not determine the cameras.
             SolverError: If a system is singular or a cue is not finite.
         """
-        count = labelled.tracks.num_frames
         self.timestamps, self.image_size, self.camera = timestamps, image_size, camera
-        self.frames = calibration_frames(
-            TrackSpans.of(labelled), count, config.camera.frames, config.windows.calibration_sightings
-        )
-        self.tracks = thinned(labelled, config.camera.observations * count // len(self.frames))
-        settings = settings_of_fit(config, consecutive=len(self.frames) == int(self.frames[-1]) + 1)
+        self.sample = CalibrationSample.of(labelled, config)
+        self.tracks = self.sample.tracks(config.camera.observations)
+        settings = self.sample.settings(config)
         stage = settings.bundle_adjustment.model_copy(update={"first_depth_sigma": None})
         self.fit = LensFit(settings, self._at(None), camera.intrinsics, run, hooks).with_stage(stage)
         self.scene: StaticScene = self.fit.scene(PINHOLE, camera.intrinsics)
@@ -93,7 +90,7 @@ class ReadoutFit:
         """Return the readout that explains the tracks best, and whether they ask for it."""
         if self.scene.noise.measured_px < EXACT_PX or len(self.timestamps) < 3:
             return FoundReadout(None, solves=self.fit.solves)
-        interval = float(np.median(np.diff(self.timestamps)))
+        interval = frame_interval(self.timestamps)
         best = min((self._along(axis, interval) for axis in ("rows", "columns")), key=self.energy)
         reprojection = self._solved[None].final_energies["static_reprojection"]
         evidence = (self.energy(None) - self.energy(best)) / max(reprojection, 1e-300)
@@ -148,4 +145,4 @@ class ReadoutFit:
         labelled = self.tracks
         if readout is not None:
             labelled = at_one_time(labelled, readout, self.timestamps, self.image_size)
-        return tracks_in(self.camera.ideal_labelled(labelled), self.frames).labelled
+        return self.sample.cut(self.camera.ideal_labelled(labelled))

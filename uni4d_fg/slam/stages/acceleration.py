@@ -92,6 +92,11 @@ class AccelerationPrior:
         ]
 
 
+def frame_interval(timestamps: FloatArray) -> float:
+    """Return the usual time between two frames with times (T,), T > 1, s."""
+    return float(np.median(np.diff(timestamps)))
+
+
 def starting_prior(
     config: AccelerationConfig, timestamps: FloatArray | None, world_T_cam: FloatArray, landmarks: FloatArray
 ) -> AccelerationPrior:
@@ -108,7 +113,7 @@ def starting_prior(
     known = timestamps is not None
     if timestamps is None:
         timestamps = np.arange(len(world_T_cam), dtype=np.float64)
-    per_frame = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 1.0
+    per_frame = frame_interval(timestamps) if len(timestamps) > 1 else 1.0
     distance = float(np.median(np.linalg.norm(landmarks - world_T_cam[:, :3, 3].mean(axis=0), axis=1)))
     weak = _WEAK / per_frame**2
     for name, given, unit in (("linear", config.linear, max(distance, 1e-9)), ("angular", config.angular, 1.0)):
