@@ -141,8 +141,12 @@ def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
     lens = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
     monkeypatch.setattr(motion, "find_camera", lambda *_: lens)
     monkeypatch.setattr(motion, "rivals_of", lambda *_: [Rival(2, 9, apart * K[0], 0.1, 0.2, 0.01)])
-    found = structure(through(tracked(sideways(FRAMES)), lens))
+    scene = through(tracked(sideways(FRAMES)), lens)
+    found = structure(scene)
     assert found.camera.lens.is_pinhole is not is_told
+    plain = structure(scene, "camera.model=pinhole", "camera.zoom=off")
+    if k1 == -0.02:  # the run says that a pinhole, with its focal length, would do nearly as well
+        assert found.focal.low <= plain.intrinsics[:2].mean() <= found.focal.high
 
 
 def test_frames_that_are_blurred_do_not_tell_a_lens() -> None:
@@ -166,7 +170,7 @@ def test_frames_that_are_blurred_do_not_tell_a_lens() -> None:
 def test_sharp_frames() -> None:
     blur = np.array([0.0, 2.0, 9.0, 0.0], np.float32)
     np.testing.assert_array_equal(sharp_frames(blur, 4), [True, True, False, True])
-    np.testing.assert_array_equal(sharp_frames(blur + np.float32(5.0), 4), [True] * 4)  # too few are left
+    np.testing.assert_array_equal(sharp_frames(blur + np.float32(7.0), 4), [True] * 4)  # too few are left
     np.testing.assert_array_equal(sharp_frames(None, 4), [True] * 4)
 
 

@@ -212,6 +212,18 @@ def test_a_lens_needs_energy_distance_and_held_out_tracks(
     assert is_taken(candidate, CameraConfig(), (480, 640)) is taken
 
 
+@pytest.mark.parametrize(
+    ("displacement_px", "held_out_gain", "taken"), [(26.0, 0.012, True), (26.0, -0.0002, False), (5.0, 0.012, False)]
+)
+def test_a_depth_cue_that_shows_a_lens_stands_in_for_energy(
+    displacement_px: float, held_out_gain: float, taken: bool
+) -> None:
+    """Not for held-out tracks, nor for a distance that errors of a tracker do not mimic."""
+    candidate = LensCandidate(Lens("SIMPLE_RADIAL", (-0.12,)), np.ones(4), 0.0014, held_out_gain, displacement_px)
+    assert is_taken(candidate, CameraConfig(), (480, 640), by_cue=True) is taken
+    assert not is_taken(candidate, CameraConfig(), (480, 640))
+
+
 @pytest.mark.parametrize(("k1", "taken"), [(-0.4, True), (1.4, True), (-1.6, False), (3.5, False)])
 def test_a_distortion_far_from_its_prior_is_no_lens(k1: float, taken: bool) -> None:
     """Things that move without a mask ask for k1 of 2 to 5 on clips of 8 and 12 tiny frames."""

@@ -126,6 +126,7 @@ def structure_from_motion(
     grown = search.grow(observations, camera.intrinsics, free_focal)
     if grown is None:
         return None
+    beside: list[float] = []  # focal lengths, px, of cameras that explain the tracks nearly as well
     if any_camera and free_focal:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
@@ -142,6 +143,7 @@ def structure_from_motion(
             ideal = found.ideal_observations(observations)
             again = search.grow(ideal, found.intrinsics, free_focal)
             if again is not None and (found.lens.is_pinhole or search.tells_lens(again, found)):
+                beside = [mean_focal(grown.scene)] if search.is_weak(found) else []
                 grown, camera, observations = again, found, ideal
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)
@@ -150,17 +152,17 @@ def structure_from_motion(
         reporter.end()
         return None
     poses = _bridge(scene.world_T_cam, scene.registered)
-    mean_focal = float(np.mean(scene.intrinsics[:2]))
-    rivals, focal = list[Rival](), FocalInterval(mean_focal, mean_focal)
+    found_focal = mean_focal(scene)
+    rivals, focal = list[Rival](), FocalInterval(found_focal, found_focal)
     focal_sigma = 0.0
     if with_doubts:
         rivals = rivals_of(hypotheses, poses)
         focal = focal_interval(scene, image_size)
         if free_focal:
-            focal = search.holding_rivals(focal, rivals)
+            focal = search.holding_rivals(focal, rivals).holding(beside)
             focal_sigma = focal.deviation
         if free_focal and focal.is_wide:
-            likely = focal.likely(mean_focal, float(np.mean(intrinsics[:2])), settings.focal_log_sigma)
+            likely = focal.likely(found_focal, float(np.mean(intrinsics[:2])), settings.focal_log_sigma)
             focal = focal.holding([likely])
             focal_sigma = focal.likely_sigma(settings.focal_log_sigma)
             scene.hold_focal(likely)
@@ -220,6 +222,11 @@ class _Search:
         usual = np.array(self.config.geometric_depth.usual_focal) * max(self.image_size)
         return focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
 
+    def is_weak(self, camera: CameraModel) -> bool:
+        """Tell whether a lens bends images so little that errors of tracks may do the same."""
+        displacement = camera.lens.displacement(camera.intrinsics, self.image_size)
+        return strength_of(camera.lens, displacement, self.image_size, self.config.camera) is Strength.WEAK
+
     def tells_lens(self, grown: _Grown, camera: CameraModel) -> bool:
         """Tell whether tracks that leave a lens, and a scene grown with it, leave no doubt of the focal length.
 
@@ -230,12 +237,16 @@ class _Search:
         scene = grown.scene
         if focal_is_open(scene, self.image_size):
             return False
-        displacement = camera.lens.displacement(camera.intrinsics, self.image_size)
-        if strength_of(camera.lens, displacement, self.image_size, self.config.camera) is not Strength.WEAK:
+        if not self.is_weak(camera):
             return True
         rivals = rivals_of(grown.hypotheses, scene.world_T_cam)
-        focal = float(np.mean(scene.intrinsics[:2]))
+        focal = mean_focal(scene)
         return self.holding_rivals(FocalInterval(focal, focal), rivals).reach(focal) <= OPEN_FOCAL
+
+
+def mean_focal(scene: GrowingScene) -> float:
+    """Return the mean of both focal lengths, px."""
+    return float(np.mean(scene.intrinsics[:2]))
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:

@@ -16,6 +16,10 @@ from uni4d_fg.slam.stages.bundle_adjustment import without_depth_prior
 _SOUND_TREND, _TREND = 0.005, 0.025
 """Of depth over the image, beside a cue that is sound with the pinhole and beside one that is not: worth a closer look,
 which costs half a second. Pinholes have up to 0.7 and 2.3 %, but for three; k1 of -0.1 to -0.12 has 0.5 to 24 %."""
+_CLEAR_TREND = 0.05
+"""Of depth that no pinhole has: a lens is looked for, whatever the probe says. kitchen_dog through k1 of -0.12 has 16 %,
+and evidence of 0.14 to 0.21 %, as the tracker finds a few points here or there; held-out tracks tell it apart (1.2 %,
+and -0.02 % without a lens)."""
 _MIN_EVIDENCE = 0.003
 """Of a solve to the end beside a cue that is believed. Pinholes that explain held-out tracks better have 0.02 % at
 most, lenses 0.35 to 10 %; k1 = -0.1 straight down a corridor, where the focal length stays open, 0.1 to 0.2 %."""
@@ -62,7 +66,8 @@ class LensSearch:
             SolverError: If a system is singular or a cue is not finite.
         """
         evidence = self.fit.probe(pinhole.scene)
-        if evidence < self.settings.min_evidence:
+        by_cue = abs(depth_trend(pinhole.scene, self.image_size)) > _CLEAR_TREND
+        if evidence < self.settings.min_evidence and not by_cue:
             return pinhole, [], evidence
         candidates: list[LensCandidate] = []
         # Errors of a depth cue bend a valley as narrow as that. It has a say where tracks alone tell no lens.
@@ -72,7 +77,7 @@ class LensSearch:
             start = trial.search(self.settings.starts)
             first = trial.refine(start.scene, start.lens, "SIMPLE_RADIAL", self.settings.rounds)
             candidates = [candidate_of(replace(first, evidence=evidence), judge.gain(first, pinhole), self.image_size)]
-            if is_taken(candidates[0], self.settings, self.image_size):
+            if is_taken(candidates[0], self.settings, self.image_size, by_cue=by_cue):
                 found = self._richer(trial, judge, first, candidates)
                 return self.believing.anew(found, self.settings.rounds), candidates, evidence
         return pinhole, candidates, evidence
@@ -124,7 +129,12 @@ class LensSearch:
 
 
 def is_taken(
-    candidate: LensCandidate, settings: CameraConfig, image_size: tuple[int, int], *, after_another: bool = False
+    candidate: LensCandidate,
+    settings: CameraConfig,
+    image_size: tuple[int, int],
+    *,
+    after_another: bool = False,
+    by_cue: bool = False,
 ) -> bool:
     """Tell whether the images ask for a lens: energy, distance and held-out tracks must all speak for it.
 
@@ -133,8 +143,10 @@ def is_taken(
         settings: Limits.
         image_size: (height, width), px.
         after_another: Whether the simpler one is a lens, too, and not the pinhole.
+        by_cue: Whether a depth cue asks for a lens, in place of energy.
     """
-    if candidate.evidence < (settings.min_further_evidence if after_another else settings.min_evidence):
+    enough = settings.min_further_evidence if after_another else settings.min_evidence
+    if candidate.evidence < enough and not by_cue:
         return False
     strength = strength_of(candidate.lens, candidate.displacement_px, image_size, settings)
     if strength is Strength.NO_LENS:

@@ -11,7 +11,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array
 
-_BLURRED_PX = 4.0
+_BLURRED_PX = 6.0
 """Blur, px, from which on a frame is not asked ..."""
 _LEAST = 0.5
 """... as long as this part of all frames is left."""
