@@ -164,7 +164,7 @@ def test_frames_that_are_blurred_do_not_tell_a_lens() -> None:
         for blur in (None, np.where(blurred, np.float32(9.0), np.float32(0.0)))
     ]  # fmt: skip
     told, left_out = (None if found is None else found.camera.lens.model for found in lens)
-    assert (told, left_out) == ("RADIAL", "PINHOLE")
+    assert (told, left_out) == ("SIMPLE_RADIAL", "PINHOLE")
 
 
 def test_sharp_frames() -> None:

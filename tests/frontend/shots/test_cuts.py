@@ -151,6 +151,30 @@ def test_a_cut_that_larger_images_do_not_show_is_none(monkeypatch: pytest.Monkey
     assert find_cuts(ArrayFrames(np.stack(twice)), CONFIG) == ()
 
 
+@pytest.mark.parametrize(("part", "is_one"), [(1.0, True), (0.4, False)])
+def test_a_dissolve_that_larger_images_do_not_show_must_be_explained(
+    monkeypatch: pytest.MonkeyPatch, part: float, is_one: bool
+) -> None:
+    """No corner of a fast orbit outlives it either, and a blend of both ends explains some of it."""
+    frames = dissolved(shot(1, 40), shot(2, 40), 8).repeat(2, axis=1).repeat(2, axis=2)
+    there = cuts(frames)
+    assert len(there) == 1
+    assert there[0].start > there[0].stop
+    run = _Search.run
+
+    def small_only(search: _Search) -> tuple[Cut, ...]:
+        if max(search.frames[0].size) > CONFIG.width:
+            return ()
+        found = run(search)
+        search.explained = {cut: part * explained for cut, explained in search.explained.items()}
+        assert min(search.explained.values()) > 0.8 * part
+        return found
+
+    monkeypatch.setattr(_Search, "run", small_only)
+    monkeypatch.setattr(_Search, "is_outlived", lambda *_: False)
+    assert cuts(frames) == (there if is_one else ())
+
+
 def test_a_search_can_be_stopped() -> None:
     with pytest.raises(Cancelled):
         find_cuts(ArrayFrames(shot(0, 10)), CONFIG, lambda: True)

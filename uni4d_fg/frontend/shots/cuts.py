@@ -33,6 +33,8 @@ _REST = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _BLUR_PX = 2.0
 _PURE = 0.08
 """Share of the other shot that cannot be seen."""
+_MUCH_EXPLAINED = 0.5
+"""Of the variance of a dissolve's frames: an orbit of two degrees a frame around dancers has 0.38."""
 
 
 @dataclass(frozen=True, order=True)
@@ -67,8 +69,10 @@ def find_cuts(
     frames = _small_frames(images, range(len(images)), config, should_stop)
     if len(frames) < 2:
         return ()
-    cuts = _Search(frames, config).run()
-    return tuple(cut for cut in cuts if _is_confirmed(cut, images, config, should_stop))
+    search = _Search(frames, config)
+    return tuple(
+        cut for cut in search.run() if _is_confirmed(cut, search.explained.get(cut, 1.0), images, config, should_stop)
+    )
 
 
 def _small_frames(
@@ -84,16 +88,24 @@ def _small_frames(
 
 
 def _is_confirmed(
-    cut: Cut, images: FrameSource[ImageArray], config: ShotsConfig, should_stop: Callable[[], bool] | None
+    cut: Cut,
+    explained: float,
+    images: FrameSource[ImageArray],
+    config: ShotsConfig,
+    should_stop: Callable[[], bool] | None,
 ) -> bool:
-    """Tell whether a cut is found in larger images of the frames around it as well, or no corner outlives it there."""
+    """Tell whether a cut is found in larger images of the frames around it as well.
+
+    A dissolve of which a blend explains much need not be found there if no corner outlives it: corners do not outlive a
+    fast orbit either.
+    """
     reach = max(config.dissolve_spans) if cut.start > cut.stop else 2 * config.look_around
     around = range(max(0, cut.stop - reach), min(len(images), cut.start + reach))
     larger = config.model_copy(update={"width": config.confirming_width})
     search = _Search(_small_frames(images, around, larger, should_stop), larger)
     there = Cut(cut.stop - around.start, cut.start - around.start)
     found = any(c.stop <= there.start and there.stop <= c.start for c in search.run())
-    return found or (cut.start > cut.stop and not search.is_outlived(there))
+    return found or (cut.start > cut.stop and explained >= _MUCH_EXPLAINED and not search.is_outlived(there))
 
 
 @dataclass(frozen=True)
@@ -117,6 +129,8 @@ class _Search:
         """Whether corners were found again in it: not in the blur of a pan."""
         self.gaps: list[Span] = []
         """Where corners could not be followed, nor be found again soon."""
+        self.explained: dict[Cut, float] = {}
+        """Part of the variance of the frames of each dissolve that a blend explains; known after :meth:`run`."""
 
     def run(self) -> tuple[Cut, ...]:
         steps = map_in_order(self.step, list(range(1, len(self.frames))), thread_count())
@@ -208,13 +222,15 @@ class _Search:
             candidate = self.dissolve(span) if span.alive <= 2.0 * limit else None
             if candidate is not None and (span.alive <= limit or candidate.explained >= self.config.sure_blend):
                 found.append(candidate)
-        kept: list[Cut] = []
+        believed: list[_Dissolve] = []
         apart = self.config.look_around
         for candidate in sorted(found, key=lambda d: d.rank):
             first, last = candidate.cut.stop - apart, candidate.cut.start + apart
-            if all(last <= cut.stop or cut.start <= first for cut in kept):
-                kept.append(candidate.cut)
-        return sorted(self.extended(cut, kept, found) for cut in kept)
+            if all(last <= other.cut.stop or other.cut.start <= first for other in believed):
+                believed.append(candidate)
+        kept = [dissolve.cut for dissolve in believed]
+        self.explained = {self.extended(dissolve.cut, kept, found): dissolve.explained for dissolve in believed}
+        return sorted(self.explained)
 
     @staticmethod
     def extended(cut: Cut, kept: list[Cut], found: list[_Dissolve]) -> Cut:
