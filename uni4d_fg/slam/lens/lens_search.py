@@ -16,7 +16,7 @@ from uni4d_fg.slam.stages.bundle_adjustment import without_depth_prior
 _SOUND_TREND, _TREND = 0.005, 0.025
 """Of depth over the image, beside a cue that is sound with the pinhole and beside one that is not: worth a closer look,
 which costs half a second. Pinholes have up to 0.7 and 2.3 %, but for three; k1 of -0.1 to -0.12 has 0.5 to 24 %."""
-_CLEAR_TREND = 0.05
+_CLEAR_TREND = 0.1
 """Of depth that no pinhole has: a lens is looked for, whatever the probe says. kitchen_dog through k1 of -0.12 has 16,
 and evidence of 0.14 to 0.21 %, as the tracker finds a few points here or there; held-out tracks tell it apart (1.2 %,
 and -0.02 % without a lens)."""
