@@ -238,14 +238,13 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
         return found
     try:
         mirrored = _with_lens(replace(found, scene=other), judge, config)
-        mirrored = _with_lens(mirrored, judge, config)  # the first one began with the lens of another scene
     except SolverError:
         return found
     return mirrored if judge.better(mirrored, found)[0] > 0.0 else found
 
 
 def _with_lens(found: _Fitted, judge: _Judge, config: Config) -> _Fitted:
-    """Fit one radial parameter, and a second one where that takes energy away.
+    """Fit one radial parameter, and a second one where there is one already or it takes energy away.
 
     Which tracks agree, and where they are triangulated, depends on the lens: it is fitted again until it stays.
     """
@@ -256,11 +255,14 @@ def _with_lens(found: _Fitted, judge: _Judge, config: Config) -> _Fitted:
         fitted = _joint(start, model, config, to_the_end)
         return replace(fitted, scene=_scene_of(fitted.camera.ideal_observations(judge.real), fitted.scene))
 
+    first: LensModel = "RADIAL" if found.camera.lens.model == "RADIAL" else "SIMPLE_RADIAL"
     for _ in range(_LENS_ROUNDS):
         before = found.camera.lens.padded[0]
-        found = once(found, "SIMPLE_RADIAL")
+        found = once(found, first)
         if abs(found.camera.lens.padded[0] - before) < _LENS_STAYS:
             break
+    if first == "RADIAL":
+        return found
     richer = once(found, "RADIAL")
     return found if richer.evidence < _MIN_SECOND_EVIDENCE else richer
 
