@@ -101,6 +101,17 @@ class LabelledTracks:
         """Return the number of tracks per label name."""
         return {label.name.lower(): int((self.label == label).sum()) for label in TrackLabel}
 
+    def select(self, keep: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> LabelledTracks:
+        """Return the tracks picked by a boolean mask or by indices."""
+        return LabelledTracks(
+            self.tracks.select(keep), self.label[keep], self.instance[keep], self.weight[keep], self.depth[keep]
+        )
+
+    def in_frames(self, frames: IntArray, query_frame: Int32Array) -> LabelledTracks:
+        """Return what is seen in some frames (t,), of tracks that were started in frames (K,), counted among these."""
+        tracks = self.tracks.in_frames(frames, query_frame)
+        return replace(self, tracks=tracks, weight=self.weight[:, frames], depth=self.depth[:, frames])
+
     def without(self, rejected: BoolArray) -> LabelledTracks:
         """Return the same tracks with some of them, (K,), rejected."""
         label = np.where(rejected, np.int32(TrackLabel.REJECTED), self.label).astype(np.int32)

@@ -61,13 +61,7 @@ class Repeats:
 
     def labelled(self, labelled: LabelledTracks) -> LabelledTracks:
         """Return labelled tracks of the solved frames."""
-        tracks, at = labelled.tracks, self.solved
-        return replace(
-            labelled,
-            tracks=tracks.in_frames(at, self.shown[tracks.query_frame].astype(np.int32)),
-            weight=labelled.weight[:, at],
-            depth=labelled.depth[:, at],
-        )
+        return labelled.in_frames(self.solved, self.shown[labelled.tracks.query_frame].astype(np.int32))
 
     def expanded(self, arrays: Arrays) -> dict[str, npt.NDArray[np.generic]]:
         """Return the record of a stage over the solved frames as one over all frames."""

@@ -220,10 +220,15 @@ def _is_zoom(zoom: _Fitted, plain: _Fitted, best: _Fitted, judge: _Judge, config
     return judge.better(zoom, plain)[1] >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0
 
 
+def lens_strength(camera: CameraModel, image_size: tuple[int, int], config: Config) -> Strength:
+    """Return how strong the lens of a camera is."""
+    displacement = camera.lens.displacement(camera.intrinsics, image_size)
+    return strength_of(camera.lens, displacement, image_size, config.camera)
+
+
 def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, config: Config) -> bool:
     """Tell whether a lens bends the image enough, for what it gains: errors of a tracker mimic a weak one."""
-    displacement = camera.lens.displacement(camera.intrinsics, image_size)
-    strength = strength_of(camera.lens, displacement, image_size, config.camera)
+    strength = lens_strength(camera, image_size, config)
     if strength is Strength.NO_LENS:
         return False
     return gain >= config.camera.min_evidence_unsure if strength is Strength.WEAK else gain > 0.0
@@ -251,20 +256,19 @@ def _with_lens(found: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     settings = config.camera
     to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
 
-    def once(start: _Fitted, model: LensModel) -> _Fitted:
-        fitted = _joint(start, model, config, to_the_end)
+    def judged_anew(fitted: _Fitted) -> _Fitted:
         return replace(fitted, scene=_scene_of(fitted.camera.ideal_observations(judge.real), fitted.scene))
 
     first: LensModel = "RADIAL" if found.camera.lens.model == "RADIAL" else "SIMPLE_RADIAL"
     for _ in range(_LENS_ROUNDS):
         before = found.camera.lens.padded[0]
-        found = once(found, first)
+        found = judged_anew(_joint(found, first, config, to_the_end))
         if abs(found.camera.lens.padded[0] - before) < _LENS_STAYS:
             break
     if first == "RADIAL":
         return found
-    richer = once(found, "RADIAL")
-    return found if richer.evidence < _MIN_SECOND_EVIDENCE else richer
+    richer = _joint(found, "RADIAL", config, to_the_end)
+    return found if richer.evidence < _MIN_SECOND_EVIDENCE else judged_anew(richer)
 
 
 def _joint(start: _Fitted, model: LensModel, config: Config, options: dict[str, float]) -> _Fitted:

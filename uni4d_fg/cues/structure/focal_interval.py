@@ -111,7 +111,7 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
         Cancelled: If asked to stop.
         SolverError: If bundle adjustment fails.
     """
-    focal = float(np.mean(scene.intrinsics[:2]))
+    focal = scene.mean_focal
     deviation, noise = _deviation(scene, image_size)
     if deviation == 0.0:
         return FocalInterval(focal, focal)

@@ -212,13 +212,18 @@ class GrowingScene:
             SolverError: If the system cannot be solved.
         """
         self.free_focal = False
-        ratio = focal / float(np.mean(self.intrinsics[:2]))
+        ratio = focal / self.mean_focal
         steps = max(1, int(np.ceil(abs(np.log(ratio)) / _FOCAL_STEP)))
         stage, state, frames, rows = self.bundle()
         for _ in range(steps):
             intrinsics = state[INTRINSICS] * np.array([ratio ** (1 / steps)] * 2 + [1.0, 1.0])
             state = self._solve(stage, state.replace({INTRINSICS: intrinsics}))
         self._take(state, frames, rows)
+
+    @property
+    def mean_focal(self) -> float:
+        """Mean of both focal lengths, px."""
+        return float(np.mean(self.intrinsics[:2]))
 
     @property
     def noise_px(self) -> float:

@@ -141,7 +141,7 @@ class Competition:
             grow(scene, SilentReporter(), growth=_TRIAL_GROWTH)
         except SolverError:
             return None
-        focal = float(np.mean(scene.intrinsics[:2])) / max(self.image_size)
+        focal = scene.mean_focal / max(self.image_size)
         is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
         left = unexplained(scene, judged.select(kept_out), self.image_size)
         return Hypothesis(pair, part, scene, frames, left, is_usual)

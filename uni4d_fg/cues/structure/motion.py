@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
-from uni4d_fg.cues.structure.camera_search import find_camera
+from uni4d_fg.cues.structure.camera_search import find_camera, lens_strength
 from uni4d_fg.cues.structure.epipolar import epipolar_outliers
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval, focal_is_open
@@ -28,7 +28,7 @@ from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
-from uni4d_fg.slam.lens.strength import Strength, strength_of
+from uni4d_fg.slam.lens.strength import Strength
 from uni4d_fg.slam.stages.observations import Observations
 
 
@@ -143,7 +143,7 @@ def structure_from_motion(
             ideal = found.ideal_observations(observations)
             again = search.grow(ideal, found.intrinsics, free_focal)
             if again is not None and (found.lens.is_pinhole or search.tells_lens(again, found)):
-                beside = [mean_focal(grown.scene)] if search.is_weak(found) else []
+                beside = [grown.scene.mean_focal] if search.is_weak(found) else []
                 grown, camera, observations = again, found, ideal
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)
@@ -152,7 +152,7 @@ def structure_from_motion(
         reporter.end()
         return None
     poses = _bridge(scene.world_T_cam, scene.registered)
-    found_focal = mean_focal(scene)
+    found_focal = scene.mean_focal
     rivals, focal = list[Rival](), FocalInterval(found_focal, found_focal)
     focal_sigma = 0.0
     if with_doubts:
@@ -224,8 +224,7 @@ class _Search:
 
     def is_weak(self, camera: CameraModel) -> bool:
         """Tell whether a lens bends images so little that errors of tracks may do the same."""
-        displacement = camera.lens.displacement(camera.intrinsics, self.image_size)
-        return strength_of(camera.lens, displacement, self.image_size, self.config.camera) is Strength.WEAK
+        return lens_strength(camera, self.image_size, self.config) is Strength.WEAK
 
     def tells_lens(self, grown: _Grown, camera: CameraModel) -> bool:
         """Tell whether tracks that leave a lens, and a scene grown with it, leave no doubt of the focal length.
@@ -240,13 +239,8 @@ class _Search:
         if not self.is_weak(camera):
             return True
         rivals = rivals_of(grown.hypotheses, scene.world_T_cam)
-        focal = mean_focal(scene)
+        focal = scene.mean_focal
         return self.holding_rivals(FocalInterval(focal, focal), rivals).reach(focal) <= OPEN_FOCAL
-
-
-def mean_focal(scene: GrowingScene) -> float:
-    """Return the mean of both focal lengths, px."""
-    return float(np.mean(scene.intrinsics[:2]))
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:

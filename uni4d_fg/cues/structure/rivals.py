@@ -56,8 +56,7 @@ def rivals_of(hypotheses: list[Hypothesis], world_T_cam: FloatArray) -> list[Riv
         except SolverError:
             continue
         degrees, turns = rotation_difference(hypothesis.scene.world_T_cam, world_T_cam, frames)
-        focal = float(np.mean(hypothesis.scene.intrinsics[:2]))
-        pair = hypothesis.pair
+        pair, focal = hypothesis.pair, hypothesis.scene.mean_focal
         found.append(Rival(pair.first, pair.second, focal, hypothesis.unexplained, degrees, turns))
     return found
 

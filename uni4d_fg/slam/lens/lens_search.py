@@ -66,8 +66,8 @@ class LensSearch:
             SolverError: If a system is singular or a cue is not finite.
         """
         evidence = self.fit.probe(pinhole.scene)
-        by_cue = abs(depth_trend(pinhole.scene, self.image_size)) > _CLEAR_TREND
-        if evidence < self.settings.min_evidence and not by_cue:
+        by_cue = evidence < self.settings.min_evidence
+        if by_cue and abs(depth_trend(pinhole.scene, self.image_size)) <= _CLEAR_TREND:
             return pinhole, [], evidence
         candidates: list[LensCandidate] = []
         # Errors of a depth cue bend a valley as narrow as that. It has a say where tracks alone tell no lens.

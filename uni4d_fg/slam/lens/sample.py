@@ -41,10 +41,7 @@ class CalibrationSample:
         wanted = observations * labelled.tracks.num_frames // len(self.frames)
         if count > wanted:
             rows = rows[evenly_spread(len(rows), max(1, len(rows) * wanted // count))]
-        return LabelledTracks(
-            labelled.tracks.select(rows), labelled.label[rows], labelled.instance[rows], labelled.weight[rows],
-            labelled.depth[rows],
-        )  # fmt: skip
+        return labelled.select(rows)
 
     def cut(self, labelled: LabelledTracks) -> LabelledTracks:
         """Return the part of tracks that is seen in the frames of the sample."""

@@ -93,13 +93,11 @@ def tracks_in(labelled: LabelledTracks, frames: IntArray) -> WindowTracks:
 
     The frame in which a track was started, which may be none of these, is counted by their mean spacing.
     """
-    weight = labelled.weight[:, frames]
-    keep = np.flatnonzero((weight > 0).any(axis=1))
-    tracks = labelled.tracks.select(keep)
     step = float(np.diff(frames).mean()) if len(frames) > 1 else 1.0
-    cut = tracks.in_frames(frames, np.rint((tracks.query_frame - frames[0]) / step).astype(np.int32))
-    depth = labelled.depth[keep][:, frames]
-    return WindowTracks(LabelledTracks(cut, labelled.label[keep], labelled.instance[keep], weight[keep], depth), keep)
+    query_frame = np.rint((labelled.tracks.query_frame - frames[0]) / step).astype(np.int32)
+    cut = labelled.in_frames(frames, query_frame)
+    keep = np.flatnonzero((cut.weight > 0).any(axis=1))
+    return WindowTracks(cut.select(keep), keep)
 
 
 @dataclass(frozen=True)
