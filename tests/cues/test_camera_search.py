@@ -12,7 +12,7 @@ from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, t
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.structure import motion
-from uni4d_fg.cues.structure.camera_search import is_lens, similarities
+from uni4d_fg.cues.structure.camera_search import FoundCamera, is_lens, similarities
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
 from uni4d_fg.cues.structure.rivals import Rival
 from uni4d_fg.cues.track_motion import QuadraticGrid, SharedError
@@ -123,15 +123,38 @@ def test_a_weak_lens_must_gain_more_than_errors_of_a_tracker(k1: float, gain: fl
     assert is_lens(camera, SIZE, gain, load_config("default", [])) is is_one
 
 
-@pytest.mark.parametrize(("path", "is_told"), [(sideways, True), (forward, False)])
-def test_a_lens_is_not_believed_where_the_focal_length_is_open(
-    path: Callable[[int], np.ndarray], is_told: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("path", "gain", "is_told"), [(sideways, 0.005, True), (forward, 0.01, False), (forward, 0.03, True)]
+)
+def test_a_lens_is_not_believed_where_the_focal_length_is_open_unless_it_explains_much(
+    path: Callable[[int], np.ndarray], gain: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lens = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.02,)))
-    monkeypatch.setattr(motion, "find_camera", lambda *_: lens)
-    found = structure(tracked(path(FRAMES)))
-    assert found.focal.is_wide is not is_told
+    lens = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.12,)))
+    monkeypatch.setattr(motion, "find_camera", lambda *_: FoundCamera(lens, gain))
+    scene = through(tracked(path(FRAMES)), lens)
+    found = structure(scene)
+    assert found.focal.is_wide is (path is forward)
     assert found.camera.lens.is_pinhole is not is_told
+    if path is forward:  # either way the run says that the other camera may be the right one
+        plain = structure(scene, "camera.model=pinhole", "camera.zoom=off")
+        bent = structure_from_motion(
+            lens.ideal_observations(scene.observations), FRAMES, SIZE, GUESS, load_config("default", []),
+            SilentReporter(), lambda: False,
+        )  # fmt: skip
+        assert bent is not None
+        for focal in (plain.intrinsics[:2].mean(), bent.intrinsics[:2].mean()):
+            assert 0.97 * found.focal.low <= focal <= 1.03 * found.focal.high
+
+
+@pytest.mark.slow
+def test_a_lens_that_explains_much_is_found_where_the_focal_length_is_open() -> None:
+    lens = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.15,)))
+    scene = through(tracked(forward(FRAMES), points=1500, noise_px=0.1), lens)
+    found = structure(scene)
+    assert found.camera.lens.padded[0] == pytest.approx(-0.15, abs=0.02)
+    assert found.focal.low <= K[0] <= found.focal.high
+    assert found.intrinsics[0] == pytest.approx(K[0], rel=0.03)
+    assert path_error(found, scene) < 0.001
 
 
 @pytest.mark.parametrize(("apart", "k1", "is_told"), [(1.1, -0.02, False), (1.04, -0.02, True), (1.1, -0.12, True)])
@@ -139,7 +162,7 @@ def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
     apart: float, k1: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lens = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
-    monkeypatch.setattr(motion, "find_camera", lambda *_: lens)
+    monkeypatch.setattr(motion, "find_camera", lambda *_: FoundCamera(lens, 0.02))
     monkeypatch.setattr(motion, "rivals_of", lambda *_: [Rival(2, 9, apart * K[0], 0.1, 0.2, 0.01)])
     scene = through(tracked(sideways(FRAMES)), lens)
     found = structure(scene)

@@ -85,6 +85,15 @@ class _Fitted:
     """Part of the reprojection energy that setting the camera free took away."""
 
 
+@dataclass(frozen=True)
+class FoundCamera:
+    """A camera that is no plain pinhole."""
+
+    camera: CameraModel
+    lens_gain: float
+    """Part of the reprojection energy that its lens takes away."""
+
+
 def find_camera(
     scene: GrowingScene,
     real: Observations,
@@ -93,7 +102,7 @@ def find_camera(
     grown: Grown,
     proposed: CameraModel | None = None,
     blur_px: Float32Array | None = None,
-) -> CameraModel | None:
+) -> FoundCamera | None:
     """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom.
 
     Args:
@@ -125,16 +134,17 @@ def find_camera(
     if not (starts or asks_for_lens):
         return None
     judge = _Judge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
-    best = plain
+    best, gain = plain, 0.0
     if asks_for_lens:
         lens = _find_lens(plain, judge, config)
-        if is_lens(lens.camera, image_size, judge.better(lens, plain)[0], config):
+        gain = judge.better(lens, plain)[0]
+        if is_lens(lens.camera, image_size, gain, config):
             best = lens
     for start in starts:
         zoom = _find_zoom(start, plain, judge, scene, real, config, grown)
         if zoom is not None and (settings.zoom == "on" or _is_zoom(zoom, plain, best, judge, config)):
             best = zoom
-    return None if best is plain else best.camera
+    return None if best is plain else FoundCamera(best.camera, gain)
 
 
 def _part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> GrowingScene:
