@@ -15,7 +15,7 @@ from uni4d_fg.cues.appearance import frame_appearance, moved_evidence
 from uni4d_fg.cues.depth_range import UNKNOWN_RANGE, depth_range, spread_at_tracks
 from uni4d_fg.cues.guided_filter import guided_filter
 from uni4d_fg.cues.motion_masks import MotionMasks, motion_masks
-from uni4d_fg.cues.moving_regions import trusted_components
+from uni4d_fg.cues.moving_regions import track_evidence, trusted_components
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
@@ -210,6 +210,24 @@ def test_depth_may_be_wrong_where_it_varies_and_motion_across_the_epipolar_line_
     lost = dataclasses.replace(labelled, depth=np.where(moves[:, None], np.float32(np.nan), labelled.depth))
     vertical = find_moving_tracks(lost, spread, cameras, (120, 160), config)
     assert vertical.moving[moves].mean() > 0.5  # by their 1 cm per frame downwards
+
+
+@pytest.mark.parametrize("spacing", [4, 8])
+def test_many_tracks_that_agree_say_much_and_a_single_one_little(spacing: int) -> None:
+    """Whatever their density: on the left all move, on the right one does among static ones."""
+    grid = np.stack(np.meshgrid(np.arange(4, 160, spacing), np.arange(4, 120, spacing)), axis=-1).reshape(-1, 2)
+    moving = (grid[:, 0] < 80) & (grid[:, 0] > 20)
+    alone = np.array([100 // spacing * spacing + 4, 60 // spacing * spacing + 4])
+    moving |= (grid == alone).all(axis=1)
+    tracks = Tracks(grid[:, None].astype(np.float32), np.ones((len(grid), 1), bool), np.zeros(len(grid), np.int32))
+    motion = TrackMotion(moving, ~moving, np.zeros(len(grid)))
+    config = MotionMaskConfig(track_reach_px=6.0)
+    evidence = track_evidence(tracks, motion, 0, (120, 160), np.ones(2), config)
+    assert evidence[20:100, 40:60].min() > 0.55
+    assert evidence[20:100, 130:150].max() < -0.55
+    assert evidence[alone[1], alone[0]] < 0.0
+    by_itself = TrackMotion(moving & (grid == alone).all(axis=1), np.zeros(len(grid), bool), np.zeros(len(grid)))
+    assert track_evidence(tracks, by_itself, 0, (120, 160), np.ones(2), config).max() < 0.65
 
 
 def test_a_region_whose_tracks_are_static_is_not_believed() -> None:

@@ -70,7 +70,7 @@ class MotionMaskConfig(Section):
     track_quantile: float = setting(
         0.8, "Quantile of a track's departures over its frame pairs that is compared with both.", gt=0, le=1
     )
-    track_weight: float = setting(2.0, "Evidence of a track at its own pixel, in units of log odds.", ge=0)
+    track_weight: float = setting(5.0, "Evidence of many tracks that agree, in units of log odds.", ge=0)
     intensity_sigma: float = setting(4.0, "Standard deviation of a pixel's intensity, gray levels.", gt=0)
     occlusion_margin: float = setting(
         0.1, "A point is hidden in another frame whose depth there is smaller by more than this fraction.", gt=0
@@ -121,5 +121,8 @@ class MotionMaskConfig(Section):
         4.0, "How far a track's evidence reaches over the pixels around it, working px.", gt=0
     )
     track_undecided: float = setting(
-        0.5, "Undecided tracks that are added at every pixel: with more of them, single tracks say less.", gt=0
+        0.6,
+        "Undecided tracks that are added at every pixel, as a part of those that are usually around one: with more "
+        "of them, single tracks say less.",
+        gt=0,
     )

@@ -16,6 +16,8 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray, rows_by_group
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.borrowed_points import beside_masks, with_borrowed
+from uni4d_fg.cues.ground_plane import Ground, find_ground
 from uni4d_fg.cues.interpolated_depth import (
     InterpolatedDepths,
     SparseInverseDepth,
@@ -42,6 +44,8 @@ from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
 
+_SEEN_OFTEN = 5
+"""Points that so many frames see are used in those that do not."""
 _SPHERE_STEP = 16
 """Spacing of the nodes between which a sphere is interpolated, px."""
 
@@ -153,10 +157,9 @@ def _with_maps(
     sparse = np.full(tracks.visible.shape, np.nan, dtype=np.float32)
     known = np.isfinite(inverse)
     sparse[observations.track[known], observations.frame[known]] = 1.0 / inverse[known]
-    frames = _points_per_frame(observations, inverse, video.num_frames, settings)
-    depths, said, doubts = _place(
-        InterpolatedDepths(frames, video.image_size, settings), video, tracks, structure, reporter, should_stop
-    )
+    frames = _points_per_frame(structure, observations, inverse, video, settings)
+    maps = InterpolatedDepths(frames, video.image_size, settings, ground=_ground(structure, observations, inverse))
+    depths, said, doubts = _place(maps, video, tracks, structure, reporter, should_stop)
     triangulated = int(np.isfinite(structure.points.position[:, 0]).sum())
     fx, fy = structure.intrinsics[:2]
     facts = (
@@ -230,10 +233,25 @@ def _inverse_depths(structure: Structure, observations: Observations, config: Ge
     return out
 
 
+def _ground(structure: Structure, observations: Observations, inverse: FloatArray) -> Ground | None:
+    """Find the ground among what is triangulated well; ``inverse`` (N,) is that of every observation's point."""
+    known = np.isfinite(inverse)
+    row = np.searchsorted(structure.track, observations.track[known])
+    nearest = np.full(len(structure.track), np.inf)
+    np.minimum.at(nearest, row, 1.0 / inverse[known])
+    fine = np.isfinite(nearest) & ~structure.moving
+    plane = find_ground(structure.points.position[fine], nearest[fine], structure.world_T_cam)
+    if plane is None:
+        return None
+    ground = Ground(plane, structure.world_T_cam, structure.camera)
+    return None if ground.seen_through(observations, inverse) else ground
+
+
 def _points_per_frame(
-    observations: Observations, inverse: FloatArray, num_frames: int, config: GeometricDepthConfig
-) -> tuple[SparseInverseDepth, ...]:
+    structure: Structure, observations: Observations, inverse: FloatArray, video: Video, config: GeometricDepthConfig
+) -> tuple[SparseInverseDepth, ...]:  # fmt: skip
     """Return the points to interpolate in every frame; one without any takes those of the nearest frame."""
+    num_frames = len(structure.world_T_cam)
     known = np.flatnonzero(np.isfinite(inverse))
     rows = [known[rows] for rows in rows_by_group(observations.frame[known], num_frames)]
     found = [SparseInverseDepth(observations.uv[mine], inverse[mine]) for mine in rows]
@@ -242,7 +260,16 @@ def _points_per_frame(
         everywhere = SparseInverseDepth(np.zeros((1, 2)), np.array([1.0 / config.median_depth]))
         return (everywhere,) * num_frames
     usable = np.flatnonzero(filled)
-    return tuple(found[int(usable[np.argmin(np.abs(usable - frame))])] for frame in range(num_frames))
+    points = tuple(found[int(usable[np.argmin(np.abs(usable - frame))])] for frame in range(num_frames))
+    often = np.bincount(np.searchsorted(structure.track, observations.track[known]), minlength=len(structure.track))
+    sure = (often >= _SEEN_OFTEN) & ~structure.moving
+    if video.masks is not None:
+        sure &= ~beside_masks(video.masks, observations, int(observations.track.max(initial=-1)) + 1)[structure.track]
+    positions, size = structure.points.position[sure], video.image_size
+    return tuple(
+        with_borrowed(mine, positions, structure.world_T_cam[frame], structure.camera, frame, size, config)
+        for frame, mine in enumerate(points)
+    )
 
 
 def _place(

@@ -1,9 +1,9 @@
 """Dense depth of one frame from sparse points, and of what moves from where it stands.
 
 Inverse depth is linear in the image over any plane, so it is what is interpolated: linearly over the Delaunay
-triangles of the static points in the frame, and taken from the nearest point outside their hull. A moving
-thing has no static points of its own. It is given one depth per frame: that of the static surface at the lowest part
-of its mask, where it may touch the ground, or a smaller one (``moving_things.py``).
+triangles of the static points in the frame, and taken from the nearest point outside their hull, but no farther than
+the ground. A moving thing has no static points of its own. It is given one depth per frame: that of the static surface
+at the lowest part of its mask, where it may touch the ground, or a smaller one (``moving_things.py``).
 """
 
 from __future__ import annotations
@@ -17,12 +17,19 @@ from scipy.spatial import cKDTree
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.ground_plane import Ground
 from uni4d_fg.cues.triangle_grid import linear_on_grid
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.frames import LazyFrames
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.optim.threads import thread_count, workers_in_order
 from uni4d_fg.progress import Reporter
+
+NEAREST_SHARE = 0.75
+"""Of the inverse depths at which a thing seems to stand, the quantile that is taken: masks lose feet, which makes it
+farther, more often than they reach beyond."""
+_BEYOND = 1.05
+"""What is farther than the ground by more than this is on it."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,8 @@ class InterpolatedDepths(LazyFrames[Float32Array]):
     """T: inverse depth of every moving thing in a frame, by mask id."""
     grids: tuple[Float32Array, ...] = field(default=())
     """T: what :func:`interpolate` gives, where that was asked for before; else it is computed with each map."""
+    ground: Ground | None = None
+    """Nothing static is farther."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -62,8 +71,13 @@ class InterpolatedDepths(LazyFrames[Float32Array]):
         return enlarged(self.grids[frame] if self.grids else self.grid(frame), self.image_size)
 
     def grid(self, frame: int) -> Float32Array:
-        """Return the static inverse depth of a frame on the grid of ``config.stride``."""
-        return interpolate(self.points[frame], self.image_size, self.config.stride)
+        """Return the static inverse depth of a frame on the grid of ``config.stride``: points, and the ground."""
+        grid = interpolate(self.points[frame], self.image_size, self.config.stride)
+        if self.ground is None:
+            return grid
+        uv = grid_pixels(grid.shape, self.image_size)
+        ground = self.ground.inverse_depth(uv, frame).reshape(grid.shape).astype(np.float32)
+        return np.where(ground > _BEYOND * grid, ground, grid)
 
     def all_grids(self, reporter: Reporter, should_stop: Callable[[], bool]) -> Iterator[Float32Array]:
         """Yield :meth:`grid` of every frame, in their order, made on all threads.
@@ -126,15 +140,24 @@ def interpolate(points: SparseInverseDepth, image_size: tuple[int, int], stride:
     """
     height, width = image_size
     rows, columns = -(-height // stride), -(-width // stride)
-    # Centers as cv2.resize places them, so that its bilinear interpolation has no shift.
     scale = np.array([columns / width, rows / height])
     places = (points.uv + 0.5) * scale - 0.5
     grid = linear_on_grid(places, points.inverse_depth, (rows, columns))
-    row, column = np.nonzero(~np.isfinite(grid))
-    if len(row):
-        uv = (np.stack((column, row), axis=1) + 0.5) / scale - 0.5
-        grid[row, column] = points.inverse_depth[cKDTree(points.uv).query(uv)[1]]
+    empty = ~np.isfinite(grid)
+    if empty.any():
+        uv = grid_pixels((rows, columns), image_size)[empty.ravel()]
+        grid[empty] = points.inverse_depth[cKDTree(points.uv).query(uv)[1]]
     return grid.astype(np.float32)
+
+
+def grid_pixels(shape: tuple[int, ...], image_size: tuple[int, int]) -> FloatArray:
+    """Return where the nodes of a grid (rows, columns) are in an image (height, width), (rows * columns, 2) px.
+
+    Centers are as cv2.resize places them, so that its bilinear interpolation has no shift.
+    """
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    scale = np.array([shape[1] / image_size[1], shape[0] / image_size[0]])
+    return np.asarray((np.stack((column.ravel(), row.ravel()), axis=1) + 0.5) / scale - 0.5)
 
 
 def enlarged(grid: Float32Array, image_size: tuple[int, int]) -> Float32Array:
@@ -179,12 +202,16 @@ def ground_contact(mask: Int32Array, inverse: Float32Array, config: GeometricDep
 
 
 def smooth_over_time(standing: list[dict[int, float]], window: int) -> tuple[dict[int, float], ...]:
-    """Replace each thing's value by its median over ``window`` frames: masks lose feet from frame to frame."""
+    """Replace each thing's value by its upper quartile over ``window`` frames: masks lose feet from frame to frame."""
     half = window // 2
     return tuple(
         {
             label: float(
-                np.median([other[label] for other in standing[max(0, t - half) : t + half + 1] if label in other])
+                np.quantile(
+                    [other[label] for other in standing[max(0, t - half) : t + half + 1] if label in other],
+                    NEAREST_SHARE,
+                    method="lower",
+                )
             )
             for label in here
         }

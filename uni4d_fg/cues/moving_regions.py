@@ -36,7 +36,11 @@ def track_evidence(
     moving, static = (
         _splat(tracks, which, frame, size, scale, config.track_reach_px) for which in (motion.moving, motion.static)
     )
-    return ((moving - static) / (moving + static + config.track_undecided)).astype(np.float32)
+    around = moving + static
+    # Seen from the tracks: most pixels may have none.
+    usual = float(np.sum(around**2)) / max(float(np.sum(around)), 1e-6)
+    undecided = np.float32(config.track_undecided * max(usual, 1.0))
+    return ((moving - static) / (around + undecided)).astype(np.float32)
 
 
 def _splat(

@@ -4,7 +4,8 @@ What moves hides what is behind it, so that it is no farther than the static sur
 Most things stand there. Those that do not (they fly, they are carried, or the image cuts them off) are nearer, by a
 factor that only the camera's own motion may show (``moving_parallax.py``). Both are weighed by what it shows:
 
-- standing: ``log rho ~ N(0, 0.15^2)``, where ``rho`` is the inverse depth over that of the surface below;
+- standing: ``log rho ~ N(0, 0.15^2)``, where ``rho`` is the inverse depth over that of the surface below. Where tracks
+  show how the thing's apparent size changes, that of the frames in which it seems nearest is followed to the others;
 - nearer: ``log rho`` exponential, 0.7 in the mean, and at most ``log 8``.
 """
 
@@ -16,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from uni4d_fg.cues.interpolated_depth import NEAREST_SHARE
 from uni4d_fg.cues.moving_parallax import Parallax, moving_parallax
 from uni4d_fg.frontend.track_model import Tracks
 
@@ -113,11 +115,11 @@ def place_moving(
             if not frames:
                 continue
             size = parallax.size[np.array(frames) - parallax.first]
-            standing = float(np.median([contacts[frame][label] for frame in frames] / size))
+            standing = float(np.quantile([contacts[frame][label] for frame in frames] / size, NEAREST_SHARE))
             stands, log_ratio = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut)
             shown |= parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
             for frame, here in zip(frames, size.tolist(), strict=True):
-                placed[frame][label] = np.exp(log_ratio) * (contacts[frame][label] if stands else standing * here)
+                placed[frame][label] = np.exp(log_ratio) * standing * here
             if not stands:
                 nearer.setdefault(label, []).append(float(np.exp(log_ratio)))
         if cut and not shown:
