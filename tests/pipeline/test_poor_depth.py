@@ -111,12 +111,12 @@ def test_a_zoom_beside_a_poor_cue_is_the_one_of_the_tracks(tmp_path: Path) -> No
 def test_a_zoom_that_only_a_poor_cue_asks_for_is_not_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = poor()
 
-    def zooming(labelled: Any, size: Any, intrinsics: np.ndarray, *_: Any) -> LensCalibration:
+    def zooming(labelled: Any, times: Any, size: Any, intrinsics: np.ndarray, *_: Any) -> LensCalibration:
         ratio = ramp(SIZE["num_frames"])
         zoom = ZoomCalibration(ratio / ratio.max(), 1.6 * intrinsics, 6.0, 0.0, ("the camera zooms",))
         return LensCalibration(PINHOLE, zoom.intrinsics, zoom=zoom)
 
-    monkeypatch.setattr(lens, "calibrate_lens", zooming)
+    monkeypatch.setattr(lens, "calibrate_with_shutter", zooming)
     summary, found = run_sound(sequence, tmp_path, make_config())
     assert summary.stages["lens"]["facts"] == ["camera model PINHOLE", "the camera zooms"]
     assert "the tracks alone ask for a pinhole that does not zoom" in summary.stages[STEP]["facts"]

@@ -20,8 +20,9 @@ from uni4d_fg.pipeline.steps import STOPPED
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.pipeline.warnings import focal_warnings
-from uni4d_fg.slam.lens.calibration import LensCalibration, calibrate_lens
+from uni4d_fg.slam.lens.calibration import LensCalibration
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.shutter_calibration import calibrate_with_shutter
 
 
 def as_pinhole(
@@ -128,15 +129,16 @@ def lens_step(
         Cancelled: If the user interrupts.
     """
     try:
-        found = calibrate_lens(labelled, sequence.image_size, sequence.intrinsics, config, sequence.lens, hooks, run)
+        found = calibrate_with_shutter(
+            labelled, sequence.timestamps, sequence.image_size, sequence.intrinsics, config, sequence.lens, hooks, run
+        )
     except (DegenerateProblemError, SolverError) as error:
         if config.camera.model != "auto" or config.camera.zoom == "on":
             raise
         found = LensCalibration(PINHOLE, sequence.intrinsics, note=f"no distortion was sought: {error}")
     except Cancelled as error:
         raise Cancelled(STOPPED) from error
-    zoom = found.zoom
-    camera = CameraModel(found.intrinsics, found.lens, None if zoom is None else zoom.zoom)
+    zoom, camera = found.zoom, found.camera
     # A pinhole's move on in bundle adjustment, which has its own look at them; those of a zoom are no single ones.
     alone = not camera.lens.is_pinhole and camera.zoom is None
     doubts = focal_warnings(sequence.given_intrinsics, found.intrinsics[:2]) if alone else []
@@ -163,9 +165,13 @@ def lens_step(
             "focal_sigma": zoom.open_by if np.isfinite(zoom.open_by) else None,
             "focal_px": None if zoom.zoom is None else (zoom.intrinsics[0] * zoom.zoom).tolist(),
         }
-    return StageRecord({"camera": camera.to_array(), "intrinsics": camera.intrinsics}, summary)
+    sigma = np.nan if camera.focal_sigma is None else camera.focal_sigma
+    arrays = {"camera": camera.to_array(), "intrinsics": camera.intrinsics, "focal_sigma": np.array(sigma)}
+    return StageRecord(arrays, summary)
 
 
 def found_camera(record: Mapping[str, npt.NDArray[Any]]) -> CameraModel:
     """Return the camera of a record of :func:`lens_step`, or of structure from motion."""
-    return CameraModel.of_array(record["camera"], record["intrinsics"])
+    camera = CameraModel.of_array(record["camera"], record["intrinsics"])
+    sigma = float(record.get("focal_sigma", np.nan))
+    return camera if np.isnan(sigma) else replace(camera, focal_sigma=sigma)

@@ -28,6 +28,7 @@ from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
+from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import FittedLens, LensFit
 from uni4d_fg.slam.lens.lens_search import LensCandidate, LensSearch, candidate_of
 from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample, is_static
@@ -54,6 +55,14 @@ class LensCalibration:
     note: str = ""
     zoom: ZoomCalibration | None = None
     """What was found of a zoom; None where none was sought."""
+    focal_sigma: float | None = None
+    """Standard deviation of the log of focal lengths that the stages are to hold; None lets them move on."""
+
+    @property
+    def camera(self) -> CameraModel:
+        """Intrinsics, lens and zoom."""
+        zoom = None if self.zoom is None else self.zoom.zoom
+        return CameraModel(self.intrinsics, self.lens, zoom, self.focal_sigma)
 
     def facts(self) -> list[str]:
         """Say in words what was chosen and why."""
