@@ -10,6 +10,7 @@ from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.borrowed_points import beside_masks, with_borrowed
 from uni4d_fg.cues.interpolated_depth import SparseInverseDepth, interpolate
 from uni4d_fg.geometry.camera import project
+from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -70,6 +71,18 @@ def test_points_behind_the_camera_or_far_outside_are_not_borrowed() -> None:
     behind = plane((0, 320), NEAR) * -1.0
     assert len(borrowed(mine, behind).uv) == len(mine.uv)
     assert len(borrowed(mine, plane((600, 900), NEAR)).uv) == len(mine.uv)
+
+
+def test_what_a_lens_folds_back_into_the_image_is_not_borrowed() -> None:
+    """Beyond r = 1.29 in a plane at distance one, k1 = -0.2 brings directions back toward the middle."""
+    lens = CameraModel(CAMERA.intrinsics, Lens("SIMPLE_RADIAL", (-0.2,)))
+    mine = own(plane((0, 320), FAR))
+    rng = np.random.default_rng(0)
+    far_outside = np.column_stack([rng.uniform(2.1, 2.3, 400), rng.uniform(-0.1, 0.1, 400), np.ones(400)])
+    uv = lens.real(project(lens.intrinsics, far_outside), np.zeros(400, np.int64))
+    assert (uv[:, 0] < SIZE[1]).mean() > 0.5
+    after = with_borrowed(mine, far_outside, np.eye(4), lens, 0, SIZE, GeometricDepthConfig())
+    assert len(after.uv) == len(mine.uv)
 
 
 def test_tracks_beside_masks_in_most_of_their_frames_are_known() -> None:

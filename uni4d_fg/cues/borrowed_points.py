@@ -73,10 +73,15 @@ def with_borrowed(
     gap, margin = _GAP * max(image_size), _MARGIN * max(image_size)
     x = world_to_camera(world_T_cam, positions)
     x = x[x[:, 2] > NEAR_PLANE]
-    uv, inverse = camera.real(project(camera.intrinsics, x), np.full(len(x), frame)), 1.0 / x[:, 2]
+    ideal, inverse, frames = project(camera.intrinsics, x), 1.0 / x[:, 2], np.full(len(x), frame)
+    uv = camera.real(ideal, frames)
     height, width = image_size
     with np.errstate(invalid="ignore"):
         inside = ((uv > -margin) & (uv < (width + margin, height + margin))).all(axis=1)
+    if not camera.lens.is_pinhole:
+        # Far outside of the image, the polynomial of a lens folds back into it.
+        with np.errstate(invalid="ignore"):
+            inside &= (np.abs(camera.ideal(uv, frames) - ideal) < 1.0).all(axis=1)
     uv, inverse = uv[inside], inverse[inside]
     distance, nearest = cKDTree(points.uv).query(uv)
     shown = (distance > gap) & (inverse > _HIDDEN * points.inverse_depth[nearest])

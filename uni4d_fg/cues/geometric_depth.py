@@ -266,10 +266,12 @@ def _points_per_frame(
     if video.masks is not None:
         sure &= ~beside_masks(video.masks, observations, int(observations.track.max(initial=-1)) + 1)[structure.track]
     positions, size = structure.points.position[sure], video.image_size
-    return tuple(
-        with_borrowed(mine, positions, structure.world_T_cam[frame], structure.camera, frame, size, config)
-        for frame, mine in enumerate(points)
-    )
+
+    def of_frame(frame: int) -> SparseInverseDepth:
+        pose = structure.world_T_cam[frame]
+        return with_borrowed(points[frame], positions, pose, structure.camera, frame, size, config)
+
+    return tuple(map_in_order(of_frame, list(range(num_frames)), thread_count()))
 
 
 def _place(

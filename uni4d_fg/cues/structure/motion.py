@@ -236,14 +236,14 @@ class _Search:
         """Tell whether a lens bends images so little that errors of tracks may do the same."""
         return lens_strength(camera, self.image_size, self.config) is Strength.WEAK
 
-    def tells_lens(self, grown: _Grown, found: FoundCamera, focal_is_open: bool) -> bool:
+    def tells_lens(self, grown: _Grown, found: FoundCamera, is_open: bool) -> bool:
         """Tell whether tracks that leave a lens, and a scene grown with it, leave no doubt of the lens.
 
-        Where they leave the focal length open, as straight forward, they leave distortion open as well, unless it
-        explains much. A weak lens is also doubted where starts end at focal lengths so far from each other that a run
-        says so: an error that bends the scene of one of them bends the lens, too.
+        Where they leave the focal length open (``is_open``), as straight forward, they leave distortion open as well,
+        unless it explains much. A weak lens is also doubted where starts end at focal lengths so far from each other
+        that a run says so: an error that bends the scene of one of them bends the lens, too.
         """
-        if focal_is_open and found.lens_gain < _CLEAR_GAIN:
+        if is_open and found.lens_gain < _CLEAR_GAIN:
             return False
         if not self.is_weak(found.camera):
             return True
