@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import array_api_compat
 import numpy as np
@@ -14,6 +14,8 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 Int32Array: TypeAlias = npt.NDArray[np.int32]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
+
+ScalarT = TypeVar("ScalarT", bound=np.generic)
 
 # Residual functions accept either numpy.ndarray or torch.Tensor; neither is a subtype of the other.
 Array: TypeAlias = Any
@@ -27,6 +29,13 @@ def namespace(array: Array) -> Any:
 def evenly_spread(count: int, limit: int) -> IntArray:
     """Return up to ``limit`` of the indices 0 .. count - 1, evenly spread, ascending, first and last among them."""
     return np.linspace(0, count - 1, min(count, limit)).astype(np.int64)
+
+
+def at_nearest_pixel(values: npt.NDArray[ScalarT], uv: npt.NDArray[np.floating]) -> npt.NDArray[ScalarT]:
+    """Return what a map (H, W) has at the pixel nearest to each position (N, 2) px; outside of it, at its border."""
+    column, row = np.clip(np.rint(uv), 0, (values.shape[1] - 1, values.shape[0] - 1)).astype(np.int64).T
+    found: npt.NDArray[ScalarT] = values[row, column]
+    return found
 
 
 def rows_by_group(group: npt.NDArray[np.integer], count: int) -> list[IntArray]:

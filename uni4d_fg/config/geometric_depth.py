@@ -60,7 +60,7 @@ class GeometricDepthConfig(Section):
         gt=0, le=1,
     )  # fmt: skip
     contact_smoothing: int = setting(
-        9, "The depth at which a moving thing stands is the nearest quarter of that of this many frames.", ge=1
+        9, "The depth at which a moving thing stands is the nearer quartile over this many frames.", ge=1
     )
     moving_depth_sigma: float = setting(
         0.15, "Standard deviation of the log depth of moving things, known only from where they stand.", gt=0

@@ -6,15 +6,14 @@ holds in every frame, also beyond the borders of the image, between which and th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, rows_by_group
+from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, at_nearest_pixel, rows_by_group
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.interpolated_depth import SparseInverseDepth, supported
+from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
@@ -34,7 +33,7 @@ _MUCH_NEARER = 1.6
 """... by this factor: less is a surface seen at an angle."""
 
 
-def beside_masks(masks: Iterable[Int32Array], observations: Observations, num_tracks: int) -> BoolArray:
+def beside_masks(masks: FrameSource[Int32Array], observations: Observations, num_tracks: int) -> BoolArray:
     """Return which tracks (K,) are mostly beside something that moves.
 
     Args:
@@ -43,15 +42,12 @@ def beside_masks(masks: Iterable[Int32Array], observations: Observations, num_tr
         num_tracks: K.
     """
     beside = np.zeros(num_tracks, dtype=np.int64)
-    groups = rows_by_group(observations.frame, int(observations.frame.max(initial=-1)) + 1)
-    for mask, mine in zip(masks, groups, strict=False):
-        if not len(mine) or not mask.any():
+    for mask, mine in zip(masks, rows_by_group(observations.frame, len(masks)), strict=True):
+        if not mask.any():
             continue
         size = 2 * round(_BESIDE * max(mask.shape)) + 1
         near = cv2.dilate((mask > 0).astype(np.uint8), np.ones((size, size), np.uint8))
-        column, row = np.rint(observations.uv[mine]).astype(np.int64).T
-        at = near[np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)]
-        beside[observations.track[mine[at > 0]]] += 1
+        beside[observations.track[mine[at_nearest_pixel(near, observations.uv[mine]) > 0]]] += 1
     return np.asarray(2 * beside > np.bincount(observations.track, minlength=num_tracks))
 
 
@@ -78,9 +74,8 @@ def with_borrowed(
     height, width = image_size
     with np.errstate(invalid="ignore"):
         inside = ((uv > -margin) & (uv < (width + margin, height + margin))).all(axis=1)
-    if not camera.lens.is_pinhole:
-        # Far outside of the image, the polynomial of a lens folds back into it.
-        with np.errstate(invalid="ignore"):
+        if not camera.lens.is_pinhole:
+            # Far outside of the image, the polynomial of a lens folds back into it.
             inside &= (np.abs(camera.ideal(uv, frames) - ideal) < 1.0).all(axis=1)
     uv, inverse = uv[inside], inverse[inside]
     distance, nearest = cKDTree(points.uv).query(uv)

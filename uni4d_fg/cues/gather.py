@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array, at_nearest_pixel
 from uni4d_fg.config.models import Config
 from uni4d_fg.counted import counted
 from uni4d_fg.cues.cache import FloatMaps
@@ -331,9 +331,7 @@ def static_tracks(tracks: Tracks, masks: FrameSource[Int32Array]) -> BoolArray:
     static = np.ones(tracks.num_tracks, bool)
     for frame, mask in enumerate(masks):
         seen = np.flatnonzero(tracks.visible[:, frame])
-        pixel: FloatArray = np.rint(tracks.uv[seen, frame]).astype(np.int64)
-        x, y = np.clip(pixel[:, 0], 0, mask.shape[1] - 1), np.clip(pixel[:, 1], 0, mask.shape[0] - 1)
-        static[seen[mask[y, x] != 0]] = False
+        static[seen[at_nearest_pixel(mask, tracks.uv[seen, frame]) != 0]] = False
     return static
 
 

@@ -157,7 +157,7 @@ def _with_maps(
     sparse = np.full(tracks.visible.shape, np.nan, dtype=np.float32)
     known = np.isfinite(inverse)
     sparse[observations.track[known], observations.frame[known]] = 1.0 / inverse[known]
-    frames = _points_per_frame(structure, observations, inverse, video, settings)
+    frames = _points_per_frame(structure, observations, inverse, video, tracks.num_tracks, settings)
     maps = InterpolatedDepths(frames, video.image_size, settings, ground=_ground(structure, observations, inverse))
     depths, said, doubts = _place(maps, video, tracks, structure, reporter, should_stop)
     triangulated = int(np.isfinite(structure.points.position[:, 0]).sum())
@@ -248,7 +248,8 @@ def _ground(structure: Structure, observations: Observations, inverse: FloatArra
 
 
 def _points_per_frame(
-    structure: Structure, observations: Observations, inverse: FloatArray, video: Video, config: GeometricDepthConfig
+    structure: Structure, observations: Observations, inverse: FloatArray, video: Video, num_tracks: int,
+    config: GeometricDepthConfig,
 ) -> tuple[SparseInverseDepth, ...]:  # fmt: skip
     """Return the points to interpolate in every frame; one without any takes those of the nearest frame."""
     num_frames = len(structure.world_T_cam)
@@ -264,7 +265,7 @@ def _points_per_frame(
     often = np.bincount(np.searchsorted(structure.track, observations.track[known]), minlength=len(structure.track))
     sure = (often >= _SEEN_OFTEN) & ~structure.moving
     if video.masks is not None:
-        sure &= ~beside_masks(video.masks, observations, int(observations.track.max(initial=-1)) + 1)[structure.track]
+        sure &= ~beside_masks(video.masks, observations, num_tracks)[structure.track]
     positions, size = structure.points.position[sure], video.image_size
 
     def of_frame(frame: int) -> SparseInverseDepth:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, rows_by_group
+from uni4d_fg.geometry.camera import unproject
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -66,8 +67,7 @@ class Ground:
     def inverse_depth(self, uv: FloatArray, frame: int) -> FloatArray:
         """Return the inverse depth (N,) of the ground at pixels (N, 2) of a frame; 0 where it is not seen."""
         ideal = self.camera.ideal(uv, np.full(len(uv), frame))
-        rays = np.ones((len(uv), 3))
-        rays[:, :2] = (ideal - self.camera.intrinsics[2:]) / self.camera.intrinsics[:2]
+        rays = unproject(self.camera.intrinsics, ideal, np.ones(len(uv)))
         return np.nan_to_num(self.plane.inverse_depth(rays, self.world_T_cam[frame]))
 
     def seen_through(self, observations: Observations, inverse: FloatArray) -> bool:
@@ -122,14 +122,14 @@ def find_ground(points: FloatArray, distance: FloatArray, world_T_cam: FloatArra
     if best is None:
         return None
     for part in _REFINEMENTS:
-        on_it_now = _on(best, points, part * near)
-        if np.count_nonzero(on_it_now) < 3:
+        on_it = _on(best, points, part * near)
+        if np.count_nonzero(on_it) < 3:
             return None
-        best = _fitted(points[on_it_now], near[on_it_now], up)
-    on_it_now = _on(best, points, near)
-    if np.count_nonzero(on_it_now) < max(_MIN_ON_IT, _MIN_SHARE * len(points)):
+        best = _fitted(points[on_it], near[on_it], up)
+    on_it = _on(best, points, near)
+    if np.count_nonzero(on_it) < max(_MIN_ON_IT, _MIN_SHARE * len(points)):
         return None
-    spread = np.linalg.svd(points[on_it_now] - points[on_it_now].mean(axis=0), compute_uv=False)
+    spread = np.linalg.svd(points[on_it] - points[on_it].mean(axis=0), compute_uv=False)
     if spread[1] < _THIN * spread[0] or not (centers @ best.normal > best.offset).all():
         return None
     return best

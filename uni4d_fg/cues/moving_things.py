@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray, at_nearest_pixel
 from uni4d_fg.cues.interpolated_depth import NEAREST_SHARE
 from uni4d_fg.cues.moving_parallax import Parallax, moving_parallax
 from uni4d_fg.frontend.track_model import Tracks
@@ -54,9 +54,7 @@ class Sightings:
         if not len(labels):
             return
         seen = np.flatnonzero(self.tracks.visible[:, frame])
-        height, width = mask.shape
-        column, row = np.rint(self.tracks.uv[seen, frame]).astype(np.int64).T
-        at = mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        at = at_nearest_pixel(mask, self.tracks.uv[seen, frame])
         for label in labels.tolist():
             inside = self.inside.setdefault(label, np.zeros(self.tracks.num_tracks, np.int64))
             inside[seen[at == label]] += 1

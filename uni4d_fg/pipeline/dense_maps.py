@@ -8,7 +8,7 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, evenly_spread
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, at_nearest_pixel, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.frontend.sequence.model import GroundTruth, Sequence
 from uni4d_fg.optim.threads import OrderedMap
@@ -419,8 +419,7 @@ class DenseMaps:
         share = self._shares(frame)
         if not broken:
             # The cue is read where the landmark is, between pixels: its error there holds for the pixel nearest.
-            column, row = np.clip(np.rint(uv), 0, (self.size.width - 1, self.size.height - 1)).astype(np.int64).T
-            nearest = cue[row, column]
+            nearest = at_nearest_pixel(cue, uv)
             log_cue = np.where(np.isfinite(nearest), np.log(nearest), log_cue)
         log_z = log_scale_at + log_cue
         log_scale = float(self.scene["log_scale"][frame])

@@ -91,7 +91,7 @@ class FoundCamera:
 
     camera: CameraModel
     lens_gain: float
-    """Part of the reprojection energy that its lens takes away."""
+    """Part of the reprojection energy that a lens takes away, if one was looked for."""
 
 
 def find_camera(

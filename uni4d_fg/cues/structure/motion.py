@@ -146,15 +146,14 @@ def structure_from_motion(
         if found is not None:
             ideal = found.camera.ideal_observations(observations)
             again = search.grow(ideal, found.camera.intrinsics, free_focal)
-            if again is not None and found.camera.lens.is_pinhole:
-                grown, camera, observations = again, found.camera, ideal
-            elif again is not None:
-                is_open = any(focal_is_open(each.scene, image_size) for each in (grown, again))
-                if search.tells_lens(again, found, is_open):
-                    beside = [grown.scene.mean_focal] if is_open or search.is_weak(found.camera) else []
+            if again is not None:
+                is_lens = not found.camera.lens.is_pinhole
+                is_open = is_lens and any(focal_is_open(each.scene, image_size) for each in (grown, again))
+                taken = not is_lens or search.tells_lens(again, found, is_open)
+                if is_open or (taken and search.is_weak(found.camera)):
+                    beside = [(grown if taken else again).scene.mean_focal]
+                if taken:
                     grown, camera, observations = again, found.camera, ideal
-                elif is_open:
-                    beside = [again.scene.mean_focal]
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]
     reporter.begin("focal lengths", None)
     sigma = scene.measure_noise()

@@ -57,15 +57,18 @@ def calibrate_with_shutter(
         SolverError: If a system is singular or a cue is not finite.
         Cancelled: If the user interrupts.
     """
-    found = calibrate_lens(labelled, image_size, intrinsics, config, given, hooks, run)
+
+    def calibrated(tracks: LabelledTracks) -> LensCalibration:
+        return calibrate_lens(tracks, image_size, intrinsics, config, given, hooks, run)
+
+    found = calibrated(labelled)
     if found.camera.is_plain or config.camera.has_rolling_shutter:
         return found
     try:
         shutter = ReadoutFit(labelled, timestamps, image_size, found.camera, config, run, hooks).find()
         if shutter.readout is None:
             return replace(found, solves=found.solves + shutter.solves)
-        unrolled = at_one_time(labelled, shutter.readout, timestamps, image_size)
-        again = calibrate_lens(unrolled, image_size, intrinsics, config, given, hooks, run)
+        again = calibrated(at_one_time(labelled, shutter.readout, timestamps, image_size))
     except (DegenerateProblemError, SolverError):
         return found
     part = abs(shutter.readout.seconds) / frame_interval(timestamps)
