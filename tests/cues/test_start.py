@@ -10,13 +10,11 @@ from cues.start_scenes import GUESS, SIZE, K, TrackedScene, camera_path, forward
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.epipolar import epipolar_outliers
+from uni4d_fg.cues.structure.epipolar import epipolar_geometry
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, clustered_deviation, design_effect, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow, misfits
-from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, Part, distinct, trial_frames
-from uni4d_fg.cues.structure.judging import held_out
 from uni4d_fg.cues.structure.motion import Structure, only_turns, structure_from_motion
 from uni4d_fg.cues.structure.rivals import rotation_difference
 from uni4d_fg.cues.structure.two_view import parallax
@@ -60,7 +58,7 @@ def test_a_large_thing_near_the_camera_does_not_become_the_world(seed: int) -> N
 def test_tracks_of_the_thing_disagree_with_the_picture() -> None:
     scene = tracked(sideways(FRAMES), 3, points=1500, moving=350, size=0.6)
     tracks, _ = scene.observations.rows()
-    outlier = epipolar_outliers(scene.observations, FRAMES, SIZE, CONFIG.geometric_depth)
+    outlier = epipolar_geometry(scene.observations, FRAMES, SIZE, CONFIG.geometric_depth).outlier
     moves = scene.moves[tracks]
     assert outlier[moves].mean() > 0.6
     assert outlier[~moves].mean() < 0.1
@@ -118,59 +116,6 @@ def scene_of(tracks: TrackedScene, intrinsics: np.ndarray = K) -> GrowingScene:
     )  # fmt: skip
 
 
-def test_a_bad_pair_loses_and_an_unusual_focal_length_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    tracks = tracked(sideways(FRAMES), 4, points=60)
-    nothing = np.zeros(len(tracks.observations), dtype=bool)
-    competition = Competition(tracks.observations, nothing, FRAMES, SIZE, GUESS, CONFIG, True, lambda: False)
-    pairs = [FramePair(3, 4, 2.0, 300), FramePair(5, 13, 30.0, 200), FramePair(6, 19, 30.0, 100)]
-    left = {pairs[0]: 0.5, pairs[1]: 0.22, pairs[2]: 0.1}
-    tried = []
-
-    def trial(pair: FramePair, factor: float, part: Part) -> Hypothesis:
-        tried.append((pair, factor))
-        is_usual = pair != pairs[2]
-        return Hypothesis(pair, part, with_cameras(tracks), np.arange(FRAMES), left[pair], is_usual)
-
-    monkeypatch.setattr(competition, "pairs", lambda _: pairs)
-    monkeypatch.setattr(competition, "trial", trial)
-    assert [h.pair for h in competition.run()] == [pairs[1], pairs[1], pairs[1], pairs[2], pairs[0]]
-    # Other focal lengths are tried from the best pair.
-    assert tried[3:] == [(pairs[1], 0.75), (pairs[1], 1.4)]
-
-
-def with_cameras(tracks: TrackedScene, turned: float = 0.0) -> GrowingScene:
-    """A scene with the true cameras, every second one turned about the view by a few degrees."""
-    scene = scene_of(tracks, K)
-    scene.registered[:] = True
-    turns = se3.so3_exp(np.radians([[0.0, 0.0, turned * (frame % 2)] for frame in range(FRAMES)]))
-    scene.world_T_cam[:] = tracks.world_T_cam
-    scene.world_T_cam[:, :3, :3] = scene.world_T_cam[:, :3, :3] @ turns
-    scene.triangulate_all()
-    return scene
-
-
-@pytest.mark.parametrize(
-    ("other", "turned", "is_usual", "wins"),
-    [(0, 0.5, True, True), (0, 0.0, True, False), (1, 0.5, True, False), (0, 0.5, False, False)],
-    ids=["explains better", "as well", "on other frames", "with an unusual focal length"],
-)
-def test_of_one_pair_the_start_that_explains_better_what_it_explains_wins(
-    other: int, turned: float, is_usual: bool, wins: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Though it leaves more unexplained: the one of more parallax has more points, be it as wrong as it may."""
-    tracks = tracked(sideways(FRAMES), 4, points=200)
-    nothing = np.zeros(len(tracks.observations), dtype=bool)
-    competition = Competition(tracks.observations, nothing, FRAMES, SIZE, GUESS, CONFIG, True, lambda: False)
-    pairs = [FramePair(5, 13, 30.0, 200), FramePair(6, 19, 30.0, 100)]
-    first = Hypothesis(pairs[0], "majority", with_cameras(tracks, turned), np.arange(FRAMES), 0.05, True)
-    rival = Hypothesis(pairs[other], "majority", with_cameras(tracks), np.arange(FRAMES), 0.09, is_usual)
-    tried = {(pairs[0], 1.0): first, (pairs[1], 1.0) if other else (pairs[0], 0.75): rival}
-    monkeypatch.setattr(competition, "pairs", lambda _: pairs)
-    monkeypatch.setattr(competition, "trial", lambda pair, factor, _: tried.get((pair, factor)))
-    ranked = competition.run()
-    assert [one.unexplained for one in ranked] == ([0.09, 0.05] if wins else [0.05, 0.09])
-
-
 def test_views_that_fit_badly_are_taken_out_and_posed_again() -> None:
     tracks = tracked(sideways(FRAMES), 5)
     scene = scene_of(tracks)
@@ -206,16 +151,6 @@ def test_judging_what_has_changed_is_judging_all() -> None:
     assert np.count_nonzero(scene.good) > 1000
 
 
-def test_what_is_held_out_leaves_both_ends_of_every_track() -> None:
-    observations = tracked(sideways(FRAMES), 6, points=60).observations
-    out = held_out(observations, 4)
-    assert 0.12 < out.mean() < 0.25
-    first = np.flatnonzero(np.diff(observations.track, prepend=-1))
-    last = np.append(first[1:] - 1, len(observations) - 1)
-    assert not out[first].any()
-    assert not out[last].any()
-
-
 def test_errors_that_are_alike_count_once(rng: np.random.Generator) -> None:
     group = np.repeat(np.arange(300), 10)
     alone = rng.normal(0, 1, (3000, 2))
@@ -231,22 +166,6 @@ def test_a_held_focal_length_is_not_open() -> None:
     grow(scene, SilentReporter())
     interval = focal_interval(scene, SIZE)
     assert interval.low == interval.high == pytest.approx(K[0])
-
-
-def test_frames_of_a_trial_hold_the_pair_and_lie_around_it() -> None:
-    pair = FramePair(30, 46, 30.0, 100)
-    frames = trial_frames(pair, 300, 8, 24)
-    assert len(frames) == 24
-    assert {30, 46} <= set(frames.tolist())
-    assert frames[0] == 16
-    assert frames[-1] == 62
-    np.testing.assert_array_equal(trial_frames(FramePair(0, 2, 9.0, 50), 4, 8, 24), [0, 1, 2, 3])
-
-
-def test_pairs_that_compete_lie_apart() -> None:
-    pairs = [FramePair(a, b, 30.0, 100) for a, b in ((0, 10), (1, 11), (0, 9), (20, 30), (22, 30))]
-    assert [(p.first, p.second) for p in distinct(pairs, 2)] == [(0, 10), (20, 30)]
-    assert len(distinct(pairs, 4)) == 4
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

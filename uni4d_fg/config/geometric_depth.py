@@ -41,7 +41,7 @@ class GeometricDepthConfig(Section):
     focal_starts: tuple[float, ...] = setting(
         (1.0, 0.75, 1.4),
         "Starting focal lengths to try on the first frames, as parts of the given one (one that is to be kept is "
-        "not varied); the one that ends with the least reprojection error is taken.",
+        "not varied), beside what pairs of frames tell of it; the one that explains the tracks best is taken.",
         min_length=1,
     )
     max_relative_sigma: float = setting(

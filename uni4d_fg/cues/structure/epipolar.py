@@ -7,6 +7,8 @@ tracks than the room. No focal length is needed.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
@@ -24,10 +26,20 @@ _PAIRS_PER_STEP = 40
 """Pairs of frames at most that each step looks at, spread over the video."""
 
 
-def epipolar_outliers(
+@dataclass(frozen=True)
+class EpipolarGeometry:
+    """What most of the picture does between pairs of frames."""
+
+    outlier: BoolArray
+    """(M,) tracks that disagree with it in most of the pairs of frames that see them."""
+    fundamental: FloatArray
+    """(P, 3, 3) fundamental matrices of the pairs, from pixels of the earlier frame to lines in the later one."""
+
+
+def epipolar_geometry(
     observations: Observations, num_frames: int, image_size: tuple[int, int], config: GeometricDepthConfig
-) -> BoolArray:
-    """Return (M,) which tracks disagree with the majority in most of the pairs of frames that see them.
+) -> EpipolarGeometry:
+    """Find the epipolar geometry of most of the picture between frames a few steps apart.
 
     Args:
         observations: N observations of M tracks.
@@ -46,33 +58,39 @@ def epipolar_outliers(
         for first in range(0, num_frames - step, max(1, step // 2, (num_frames - step) // _PAIRS_PER_STEP))
     ]
 
-    def agreement(pair: tuple[int, int]) -> tuple[IntArray, BoolArray] | None:
+    def agreement(pair: tuple[int, int]) -> tuple[IntArray, BoolArray, FloatArray] | None:
         a, b = common.between(*pair)
-        distance = _distances(observations.uv[a], observations.uv[b], cell[a], config)
-        return None if distance is None else (row[a], distance <= config.epipolar_px)
+        matrix = _agreed_on(observations.uv[a], observations.uv[b], cell[a], config)
+        if matrix is None:
+            return None
+        return row[a], _distances(matrix, observations.uv[a], observations.uv[b]) <= config.epipolar_px, matrix
 
+    matrices = []
     for found in map_in_order(agreement, pairs, thread_count()):
         if found is not None:
             tested[found[0]] += 1
             agreed[found[0]] += found[1]
-    return np.asarray((tested > 0) & (agreed < 0.5 * tested))
+            matrices.append(found[2])
+    outlier = np.asarray((tested > 0) & (agreed < 0.5 * tested))
+    return EpipolarGeometry(outlier, np.array(matrices).reshape(-1, 3, 3))
 
 
-def _distances(
+def _agreed_on(
     first: FloatArray, second: FloatArray, cell: IntArray, config: GeometricDepthConfig
 ) -> FloatArray | None:
-    """Return the distance (N,) px of pixel pairs from the epipolar geometry that most cells agree on, or None."""
+    """Return the fundamental matrix (3, 3) of pixel pairs (N, 2) that most cells agree on, or None."""
     # No more from a part with much texture than most parts have.
     usual = int(np.percentile(np.unique(cell, return_counts=True)[1], 25)) if len(cell) else 1
     used = _balanced(cell, max(1, min(config.epipolar_per_cell, usual)))
     if len(used) < _MIN_PAIRS:
         return None
-    matrix = fundamental_matrix(first[used], second[used], config.epipolar_px, _CONFIDENCE, config.two_view_trials)
-    if matrix is None:
-        return None
+    return fundamental_matrix(first[used], second[used], config.epipolar_px, _CONFIDENCE, config.two_view_trials)
+
+
+def _distances(matrix: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return Sampson's distance (N,) px of pixel pairs (N, 2) from an epipolar geometry."""
     a, b = (np.concatenate([uv, np.ones((len(uv), 1))], axis=1) for uv in (first, second))
     line, back = a @ matrix.T, b @ matrix
-    # Sampson's distance.
     slope = np.sqrt(line[:, 0] ** 2 + line[:, 1] ** 2 + back[:, 0] ** 2 + back[:, 1] ** 2)
     result: FloatArray = np.abs(np.sum(b * line, axis=1)) / np.maximum(slope, 1e-12)
     return result

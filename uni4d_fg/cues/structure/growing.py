@@ -270,9 +270,13 @@ class GrowingScene:
         With a noise assumed too large, the prior on the focal lengths would have too much of a say.
         """
         settings = self.config.bundle_adjustment
-        sigma = robust_sigma(self.errors()[self.good] / np.sqrt(2.0))
+        sigma = self.noise_of_good()
         self.sigma_px = float(np.clip(sigma, settings.min_reprojection_sigma_px, settings.reprojection_sigma_px))
         return sigma
+
+    def noise_of_good(self) -> float:
+        """Return the noise of the tracks that agree with their points, px (robust standard deviation)."""
+        return robust_sigma(self.errors()[self.good] / np.sqrt(2.0))
 
     def errors(self, some: IntArray | None = None) -> FloatArray:
         """Return the reprojection error of every observation, (N,) px; infinite without a point or behind.

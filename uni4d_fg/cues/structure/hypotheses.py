@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -13,8 +13,9 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.first_pair import FramePair, rank_pairs
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
-from uni4d_fg.cues.structure.judging import held_out, robust_energy, unexplained
+from uni4d_fg.cues.structure.judging import HeldOut, held_out
 from uni4d_fg.cues.structure.selection import spread_tracks
+from uni4d_fg.cues.structure.self_calibration import FocalGuess
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.progress import SilentReporter
 from uni4d_fg.slam.stages.observations import Observations
@@ -26,8 +27,10 @@ _UNUSUAL = 0.2
 """What an unusual focal length adds to the unexplained part."""
 _MUCH = 0.25
 """From this part of the tracks on, those that disagree with the majority may be the world."""
-_BETTER = 0.95
-"""Another focal length on the same pair wins with this part of the energy, at most."""
+_SIGMAS = 3.0
+"""Errors up to so many standard deviations of the noise are explained by it."""
+_ENOUGH = 0.2
+"""Starts that explain less than this part of what is held out do not tell the noise of the tracks."""
 _OVERLAP = 0.5
 """Pairs that overlap by more than this part of their union are one start."""
 _BESIDE_A_WALL = 2.0
@@ -50,15 +53,21 @@ class Hypothesis:
     """What it grew to, on few frames and tracks."""
     frames: IntArray
     """(t,) frames of the trial."""
-    unexplained: float
-    """Part of the held-out observations that it leaves unexplained, see :func:`unexplained`."""
+    held_out: HeldOut
+    """Its errors where it was judged."""
+    noise_px: float
+    """Noise of the tracks that it agrees with."""
     is_usual: bool
     """Whether its focal length is one that cameras have."""
+    unexplained: float
+    """Part of the held-out observations that errs by more than points may, see ``max_reprojection_px``."""
+    misfit: float
+    """Part that errs by more than the noise of the tracks, see :func:`ranked`."""
 
     @property
     def cost(self) -> float:
         """What it is ranked by."""
-        return self.unexplained + (0.0 if self.is_usual else _UNUSUAL)
+        return self.misfit + (0.0 if self.is_usual else _UNUSUAL)
 
 
 @dataclass
@@ -74,6 +83,8 @@ class Competition:
     config: Config
     free_focal: bool
     should_stop: Callable[[], bool]
+    guess: FocalGuess | None = None
+    """What pairs of frames tell of the focal length; None if nothing."""
     picked: dict[tuple[int, ...], tuple[IntArray, Observations, BoolArray]] = field(default_factory=dict)
     """What trials on the same frames share."""
 
@@ -90,13 +101,21 @@ class Competition:
             starts += [(pair, "all") for pair in chosen[:1]]
         if self.outlier.mean() >= _MUCH:
             starts += [(pair, "minority") for pair in self.pairs("minority")[:1]]
-        found = [hypothesis for pair, part in starts if (hypothesis := self.trial(pair, 1.0, part)) is not None]
+        first, *factors = self.factors()
+        found = ranked([one for pair, part in starts if (one := self.trial(pair, first, part)) is not None])
         if found and self.free_focal:
-            best = min(found, key=lambda hypothesis: hypothesis.cost)
-            factors = [factor for factor in settings.focal_starts if factor != 1.0]
+            best = found[0]
             tried = [self.trial(best.pair, factor, best.tracks) for factor in factors]
-            found += [hypothesis for hypothesis in tried if hypothesis is not None]
-        return _settled(sorted(found, key=lambda hypothesis: hypothesis.cost))
+            found = ranked(found + [hypothesis for hypothesis in tried if hypothesis is not None])
+        return found
+
+    def factors(self) -> list[float]:
+        """Return the focal lengths to start from, as parts of the given ones; that for all pairs first."""
+        starts = [1.0, *(factor for factor in self.config.geometric_depth.focal_starts if factor != 1.0)]
+        if self.guess is None or not self.free_focal:
+            return starts
+        told = self.guess.focal / float(np.mean(self.intrinsics[:2]))
+        return [told, *starts] if self.guess.is_agreed else [*starts, told]
 
     def chosen(self, part: Part) -> BoolArray:
         """Return (N,) which observations belong to a part of the tracks."""
@@ -143,8 +162,9 @@ class Competition:
             return None
         focal = scene.mean_focal / max(self.image_size)
         is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
-        left = unexplained(scene, judged.select(kept_out), self.image_size)
-        return Hypothesis(pair, part, scene, frames, left, is_usual)
+        judgement = HeldOut.of(scene, judged.select(kept_out), self.image_size)
+        left = judgement.unexplained(settings.max_reprojection_px)
+        return Hypothesis(pair, part, scene, frames, judgement, scene.noise_of_good(), is_usual, left, left)
 
     def _picked(self, frames: IntArray) -> tuple[IntArray, Observations, BoolArray]:
         """Return the observations (n,) that trials on some frames use, in full as well, and which (n,) are held out."""
@@ -159,31 +179,20 @@ class Competition:
         return self.picked[key]
 
 
-def _settled(ranked: list[Hypothesis]) -> list[Hypothesis]:
-    """Return the hypotheses with the one first that fits best of those that differ from the first in where f began.
+def ranked(found: list[Hypothesis]) -> list[Hypothesis]:
+    """Return starts in the order of how much they explain to within the noise of the tracks, the best first.
 
-    A minimum beside the right one may have the points of its tracks nearer to the cameras. Then it has more of them,
-    and leaves less unexplained, though what it explains it explains worse. On other frames and tracks energies say
-    nothing of that.
+    A large thing near the camera that moves, or a focal length that is wrong, bends a scene until it explains many
+    tracks to within some pixels, more of them than the world does; the world explains its own to the noise. That noise
+    is the least that a start has which explains enough.
     """
-    if not ranked:
-        return ranked
-    first = ranked[0]
-    alike = [
-        one
-        for one in ranked
-        if one.pair == first.pair and one.tracks == first.tracks and one.is_usual >= first.is_usual
+    sharp = [one.noise_px for one in found if one.held_out.share_within(_SIGMAS * one.noise_px) >= _ENOUGH]
+    limit = _SIGMAS * min(sharp) if sharp else np.inf
+    judged = [
+        replace(one, misfit=one.held_out.unexplained(min(limit, one.scene.config.geometric_depth.max_reprojection_px)))
+        for one in found
     ]
-    if len(alike) < 2:
-        return ranked
-    for one in alike:
-        one.scene.measure_noise()
-    sigma = min(one.scene.noise_px for one in alike)
-    energy = [robust_energy(one.scene, sigma) for one in alike]
-    best = alike[int(np.argmin(energy))]
-    if min(energy) > _BETTER * energy[0]:
-        return ranked
-    return [best, *(one for one in ranked if one is not best)]
+    return sorted(judged, key=lambda one: one.cost)
 
 
 def trial_frames(pair: FramePair, num_frames: int, steps: int, count: int) -> IntArray:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.selection import picture_cells
 from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
-from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
+from uni4d_fg.geometry.camera import NEAR_PLANE, project, unproject, world_to_camera
 from uni4d_fg.slam.stages.observations import Observations
 
+_FAR = 1e5
+"""Points at infinity are so many times farther than the cameras are apart."""
 _LOST = 100.0
 """Errors, in sigmas, are cut here."""
 
@@ -25,22 +29,32 @@ def held_out(observations: Observations, every: int) -> BoolArray:
     return np.asarray(chosen & (position > 0) & (position < last))
 
 
-def unexplained(scene: GrowingScene, observations: Observations, image_size: tuple[int, int]) -> float:
-    """Return the part in [0, 1] of what was seen that a scene leaves unexplained.
+@dataclass(frozen=True)
+class HeldOut:
+    """How far a scene is from n observations that it was not made from."""
 
-    The mean over parts of the picture and frames of the squared reprojection error, cut at ``max_reprojection_px``.
-    What has no point, is behind the camera, or is in a frame without a pose counts as fully wrong.
+    error_px: FloatArray
+    """(n,) infinite for what has no point, is behind the camera, or is in a frame without a pose."""
+    weight: FloatArray
+    """(n,) such that every part of the picture in every frame has the same say."""
 
-    Args:
-        scene: Cameras and points.
-        observations: What they are to explain, of any tracks.
-        image_size: (height, width), px.
-    """
-    error = errors_of(scene, observations) / scene.config.geometric_depth.max_reprojection_px
-    cell = observations.frame * (int(picture_cells(observations.uv, image_size).max(initial=0)) + 1)
-    cell = cell + picture_cells(observations.uv, image_size)
-    _, row, count = np.unique(cell, return_inverse=True, return_counts=True)
-    return float(np.average(np.minimum(error, 1.0) ** 2, weights=1.0 / count[row])) if len(row) else 1.0
+    @classmethod
+    def of(cls, scene: GrowingScene, observations: Observations, image_size: tuple[int, int]) -> HeldOut:
+        """Compare a scene with observations of any tracks; ``image_size`` is (height, width), px."""
+        part = picture_cells(observations.uv, image_size)
+        cell = observations.frame * (int(part.max(initial=0)) + 1) + part
+        _, row, count = np.unique(cell, return_inverse=True, return_counts=True)
+        return cls(errors_of(scene, observations), 1.0 / count[row])
+
+    def unexplained(self, limit_px: float) -> float:
+        """Return the part in [0, 1] that is left unexplained: the mean of the squared errors, cut at a limit."""
+        if len(self.error_px) == 0:
+            return 1.0
+        return float(np.average(np.minimum(self.error_px / limit_px, 1.0) ** 2, weights=self.weight))
+
+    def share_within(self, limit_px: float) -> float:
+        """Return the part in [0, 1] that errs by no more than a limit."""
+        return float(np.average(self.error_px <= limit_px, weights=self.weight)) if len(self.error_px) else 0.0
 
 
 def robust_energy(scene: GrowingScene, sigma_px: float) -> float:
@@ -63,13 +77,48 @@ def robust_energy(scene: GrowingScene, sigma_px: float) -> float:
 
 
 def errors_of(scene: GrowingScene, observations: Observations) -> FloatArray:
-    """Return the reprojection error (N,) px of any observations; infinite without point or pose, and behind."""
+    """Return the reprojection error (N,) px of any observations; infinite without point or pose, and behind.
+
+    Tracks whose rays meet at too small an angle for a point of the scene have one here, be it at infinity: else cameras
+    that bend the scene until it shows parallax would explain more than those that turn, as the real ones did.
+    """
     tracks, _ = scene.observations.rows()
     row = np.minimum(np.searchsorted(tracks, observations.track), len(tracks) - 1)
     known = (tracks[row] == observations.track) & scene.registered[observations.frame]
-    x = world_to_camera(scene.world_T_cam[observations.frame], scene.position[row])
+    x = world_to_camera(scene.world_T_cam[observations.frame], _points_of_all(scene)[row])
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.linalg.norm(observations.uv - project(scene.intrinsics, x), axis=1)
         known &= np.isfinite(error) & (x[:, 2] > NEAR_PLANE)
     result: FloatArray = np.where(known, error, np.inf)
+    return result
+
+
+def _points_of_all(scene: GrowingScene) -> FloatArray:
+    """Return the points (M, 3) of a scene, with one for each track that it has none of."""
+    position = scene.position.copy()
+    missing = ~np.isfinite(position[:, 0])
+    rays = scene.registered[scene.observations.frame] & missing[scene.row]
+    if not rays.any():
+        return position
+    seen = scene.observations.select(rays)
+    bundle = RayBundle(scene.row[rays], scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, scene.num_tracks)
+    near = triangulate(bundle, scene.config.geometric_depth.triangulation_huber_px)
+    far = _at_infinity(bundle)
+    for points in (near.position, far):
+        still = ~np.isfinite(position[:, 0]) & missing
+        position[still] = points[still]
+    return position
+
+
+def _at_infinity(rays: RayBundle) -> FloatArray:
+    """Return points (M, 3) in the mean direction of the rays of each track, too far to show parallax; NaN without."""
+    in_camera = unproject(rays.intrinsics, rays.uv, np.ones(len(rays.uv)))
+    in_camera /= np.linalg.norm(in_camera, axis=1, keepdims=True)
+    direction = (rays.world_T_cam[rays.frame, :3, :3] @ in_camera[..., None])[..., 0]
+    total = np.stack([np.bincount(rays.row, direction[:, a], rays.count) for a in range(3)], axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    centers = rays.world_T_cam[np.unique(rays.frame), :3, 3]
+    distance = _FAR * max(float(np.linalg.norm(np.ptp(centers, axis=0))), NEAR_PLANE)
+    with np.errstate(invalid="ignore"):
+        result: FloatArray = centers.mean(axis=0) + distance * total / np.where(length > 0, length, np.nan)
     return result

@@ -12,7 +12,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength
-from uni4d_fg.cues.structure.epipolar import epipolar_outliers
+from uni4d_fg.cues.structure.epipolar import epipolar_geometry
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval, focal_is_open
 from uni4d_fg.cues.structure.growing import GrowingScene
@@ -21,6 +21,7 @@ from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
+from uni4d_fg.cues.structure.self_calibration import focal_of_pairs
 from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
 from uni4d_fg.cues.structure.trimming import trim_and_converge
 from uni4d_fg.cues.structure.two_view import fit_rotation
@@ -62,7 +63,7 @@ class Structure:
     """Standard deviation of the log of the focal lengths that were found; 0 for those that were held."""
     unexplained: float
     """Part of the held-out observations of the first frames that their cameras leave unexplained, see
-    :func:`~uni4d_fg.cues.structure.judging.unexplained`."""
+    :class:`~uni4d_fg.cues.structure.judging.HeldOut`."""
     rivals: list[Rival]
     """Starts that explain them nearly as well."""
 
@@ -207,10 +208,12 @@ class _Search:
         """Let starts compete, and grow and trim the best; None if no two frames have parallax."""
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
-        outlier = epipolar_outliers(used, self.num_frames, self.image_size, settings)[used.rows()[1]]
+        epipolar = epipolar_geometry(used, self.num_frames, self.image_size, settings)
+        guess = focal_of_pairs(epipolar.fundamental, self.image_size, intrinsics[2:]) if free_focal else None
         competition = Competition(
-            used, outlier, self.num_frames, self.image_size, intrinsics, self.config, free_focal, self.should_stop
-        )
+            used, epipolar.outlier[used.rows()[1]], self.num_frames, self.image_size, intrinsics, self.config,
+            free_focal, self.should_stop, guess,
+        )  # fmt: skip
         self.reporter.begin("starting views", None)
         hypotheses = competition.run()
         self.reporter.end()

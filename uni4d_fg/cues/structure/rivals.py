@@ -48,7 +48,7 @@ def rivals_of(hypotheses: list[Hypothesis], world_T_cam: FloatArray) -> list[Riv
     found = []
     for hypothesis in hypotheses:
         frames = np.flatnonzero(hypothesis.scene.registered)
-        if hypothesis.unexplained > hypotheses[0].unexplained + _NEARLY_AS_WELL or len(frames) < _LEAST_COMMON:
+        if hypothesis.misfit > hypotheses[0].misfit + _NEARLY_AS_WELL or len(frames) < _LEAST_COMMON:
             continue
         try:
             hypothesis.scene.measure_noise()
