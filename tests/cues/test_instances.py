@@ -147,6 +147,27 @@ def test_parts_of_one_thing_share_its_number() -> None:
     assert set(np.unique(associate(scene, found)[1])) == {0, 1, 2}
 
 
+@pytest.mark.parametrize(("first_touch", "stay_apart"), [(8, True), (3, False)], ids=["long apart", "hardly apart"])
+def test_things_that_were_apart_stay_so_where_they_touch(first_touch: int, stay_apart: bool) -> None:
+    """A region found by motion holds both while they pass: it is parted where one was nearer than the other."""
+    gap = [max(0, 6 * (first_touch - t)) for t in range(14)]
+    scene = Scene({1: [(30, 52 - g // 2) for g in gap], 2: [(30, 80 + g // 2) for g in gap]})
+    both = (scene.truth > 0).astype(np.int32)
+    result = associate(scene, [components(labels) for labels in both], join_parts=True)
+    counts = [len(components(labels).masks) for labels in both]
+    assert counts[first_touch - 1] == 2
+    assert counts[-1] == 1
+    first, second = (numbers_of(result, scene.truth, n) for n in (1, 2))
+    if not stay_apart:
+        assert first[-1] == second[-1]
+        return
+    assert set(first) == {first[0]}
+    assert set(second) == {second[0]}
+    for n, number in ((1, first[0]), (2, second[0])):
+        inside = scene.truth[-1] == n
+        assert (result[-1][inside] == number).mean() > 0.95
+
+
 def test_a_class_map_falls_into_its_connected_regions() -> None:
     classes = np.zeros(SIZE, np.int32)
     classes[5:20, 5:20], classes[5:20, 20:30], classes[40:60, 40:60], classes[90, 90] = 3, 4, 3, 3

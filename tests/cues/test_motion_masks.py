@@ -176,18 +176,19 @@ def test_tracks_that_move_are_told_from_those_that_do_not(rng: np.random.Generat
     poses = np.stack([se3.se3_exp(t * np.array([0.002, 0.004, 0.001, 0.02, 0.0, 0.005])) for t in range(10)])
     labelled, moves = labelled_scene(rng, poses)
     config = MotionMaskConfig()
-    first = find_outlier_tracks(labelled, INTRINSICS * (1.1, 1.1, 1, 1), config)
+    none = np.zeros(len(moves), bool)
+    first = find_outlier_tracks(labelled, INTRINSICS * (1.1, 1.1, 1, 1), config, none)
     assert first[moves].mean() > 0.9
     assert first[~moves].mean() < 0.05
     spread = np.zeros(labelled.depth.shape, np.float32)
-    found = find_moving_tracks(labelled, spread, Cameras(poses, INTRINSICS, np.zeros(10)), (120, 160), config)
+    found = find_moving_tracks(labelled, spread, Cameras(poses, INTRINSICS, np.zeros(10)), (120, 160), config, none)
     assert found.moving[moves].mean() > 0.95
     assert found.static[~moves].mean() > 0.95
     assert not (found.static & moves).any()
     assert found.moving[~moves].mean() < 0.02
     # What all tracks share is an error of the cameras: here, poses that are turned by about 2 px.
     turned = poses @ np.stack([se3.se3_exp(np.append(rng.normal(0, 0.01, 3), (0, 0, 0))) for _ in poses])
-    found = find_moving_tracks(labelled, spread, Cameras(turned, INTRINSICS, np.zeros(10)), (120, 160), config)
+    found = find_moving_tracks(labelled, spread, Cameras(turned, INTRINSICS, np.zeros(10)), (120, 160), config, none)
     assert found.static[~moves].mean() > 0.8
     assert found.moving[moves].mean() > 0.7
 
@@ -200,15 +201,15 @@ def test_depth_may_be_wrong_where_it_varies_and_motion_across_the_epipolar_line_
     labelled, moves = labelled_scene(rng, poses)
     depth, spread = labelled.depth.copy(), np.zeros(labelled.depth.shape, np.float32)
     depth[:40] *= 1.6
-    config, cameras = MotionMaskConfig(), Cameras(poses, INTRINSICS, np.zeros(10))
+    config, cameras, none = MotionMaskConfig(), Cameras(poses, INTRINSICS, np.zeros(10)), np.zeros(len(moves), bool)
     wrong = dataclasses.replace(labelled, depth=depth)
-    sure = find_moving_tracks(wrong, spread, cameras, (120, 160), config)
+    sure = find_moving_tracks(wrong, spread, cameras, (120, 160), config, none)
     assert sure.moving[:40].mean() > 0.5
     spread[:40] = 1.0
-    unsure = find_moving_tracks(wrong, spread, cameras, (120, 160), config)
+    unsure = find_moving_tracks(wrong, spread, cameras, (120, 160), config, none)
     assert unsure.moving[:40].mean() < 0.05
     lost = dataclasses.replace(labelled, depth=np.where(moves[:, None], np.float32(np.nan), labelled.depth))
-    vertical = find_moving_tracks(lost, spread, cameras, (120, 160), config)
+    vertical = find_moving_tracks(lost, spread, cameras, (120, 160), config, none)
     assert vertical.moving[moves].mean() > 0.5  # by their 1 cm per frame downwards
 
 

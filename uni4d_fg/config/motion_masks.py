@@ -24,6 +24,12 @@ class InstanceConfig(Section):
         False, "A further detection within an instance is a part of it: for regions, which break where hidden."
     )
     min_part_overlap: float = setting(0.5, "Least share of a part that lies within its instance.", gt=0, le=1)
+    min_apart_frames: int = setting(
+        5, "Where parts are joined, things that were apart for this many frames stay so where they touch.", ge=1
+    )
+    min_held_part: float = setting(
+        0.6, "Share of such a thing that a region must hold to be parted among several.", gt=0, le=1
+    )
     min_score: float = setting(0.3, "Detections below this score are dropped.", ge=0, le=1)
     min_area_px: int = setting(64, "Detections smaller than this are dropped, px.", ge=1)
     same_class: bool = setting(False, "Only detections of an instance's own class continue it.")
@@ -85,6 +91,14 @@ class MotionMaskConfig(Section):
     max_static_fraction: float = setting(
         0.5, "Regions in which more than this share of the decided tracks is static are dropped.", ge=0, le=1
     )
+    color_reach_px: int = setting(
+        24, "Regions end at edges of color, up to this far beyond what evidence says, working px; 0 for not.", ge=0
+    )
+    color_core_px: int = setting(
+        5, "What is farther than this from the edge of a region is certain to move, working px.", ge=1
+    )
+    color_margin_px: int = setting(12, "Static colors are also looked at this far around that reach, working px.", ge=1)
+    color_track_px: int = setting(2, "Around a static track outside nothing moves up to here, working px.", ge=0)
     min_frames: int = setting(5, "Instances that move in fewer frames than this are dropped.", ge=1)
     grow_px: int = setting(2, "Masks are grown by this at the end, px.", ge=0, basic=True)
     instances: InstanceConfig = setting(InstanceConfig(join_parts=True), "How regions are joined to instances.")

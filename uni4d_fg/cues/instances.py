@@ -36,6 +36,8 @@ class _Instance:
     mask: Float32Array
     velocity: FloatArray
     missed: int = 0
+    apart: int = 0
+    """Frames in which it was found by itself."""
 
     def moved_by_flow(self, flow_back: Float32Array) -> None:
         warped = warp_back(self.mask, flow_back)
@@ -93,6 +95,8 @@ def associate_instances(
         gray = shrunk_gray(image, size)
         if last is not None:
             _move(instances, flow, gray, last)
+        if config.join_parts:
+            found = _parted(found, instances, size, config)
         small = [_shrunk_mask(mask, size) for mask in found.masks]
         number_of, next_number = _assign(instances, found, small, next_number, config)
         yield _paint(found, number_of, instances, image.shape[:2], config)
@@ -144,6 +148,34 @@ def _move(instances: list[_Instance], flow: DenseFlow, gray: ImageArray, last: I
             instance.moved_by_flow(flow_back)
 
 
+def _parted(
+    found: FrameDetections, instances: list[_Instance], size: tuple[int, int], config: InstanceConfig
+) -> FrameDetections:
+    """Part regions in which several things lie that were apart before: every pixel goes to the nearest of them."""
+    known = [i for i in instances if not i.missed and i.apart >= config.min_apart_frames]
+    if len(known) < 2 or not len(found):
+        return found
+    masks, classes, scores = [], [], []
+    for mask, class_id, score in zip(found.masks, found.class_ids, found.scores, strict=True):
+        small = _shrunk_mask(mask, size)
+        inside = [i for i in known if float((i.mask * small).sum()) >= config.min_held_part * float(i.mask.sum())]
+        pieces = [mask]
+        if len(inside) > 1:
+            nearest = np.argmin([_distance(i.mask > 0.5) for i in inside], axis=0).astype(np.uint8)
+            full = cv2.resize(nearest, mask.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            pieces = [mask & (full == n) for n in range(len(inside))]
+        for piece in pieces:
+            masks.append(piece)
+            classes.append(class_id)
+            scores.append(score)
+    return FrameDetections(np.stack(masks), np.array(classes, np.int32), np.array(scores, np.float32))
+
+
+def _distance(mask: BoolArray) -> Float32Array:
+    """Return how far each pixel (h, w) is from a mask."""
+    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+
+
 def _assign(
     instances: list[_Instance],
     found: FrameDetections,
@@ -166,6 +198,7 @@ def _assign(
     for row, column in pairs:
         number_of[column] = instances[row].number
         instances[row].mask, instances[row].missed = small[column], 0
+        instances[row].apart += 1
     taken = {row for row, _ in pairs}
     if config.join_parts:
         for column in np.flatnonzero(number_of == 0).tolist():

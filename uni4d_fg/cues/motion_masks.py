@@ -8,6 +8,7 @@
    mostly seen in the other.
 3. The evidence of pixels and tracks, and of the frames next to it, is smoothed within surfaces of like color; regions
    above a threshold are kept unless their own tracks say that they are static (:mod:`uni4d_fg.cues.moving_regions`).
+   They end where colors do (:mod:`uni4d_fg.cues.region_colors`).
 4. Regions are joined to instances over time (:mod:`uni4d_fg.cues.instances`); those of few frames are dropped.
 
 What stands still through the whole video is static here, whatever it is.
@@ -32,9 +33,10 @@ from uni4d_fg.cues.depth_range import spread_at_tracks
 from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.label_store import CompressedLabels
-from uni4d_fg.cues.moving_regions import moving_region, track_evidence, trusted_components
+from uni4d_fg.cues.moving_regions import grown, moving_region, track_evidence, trusted_components
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.pixel_grid import PixelGrid
+from uni4d_fg.cues.region_colors import end_at_colors
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.static_scene import relative_pose
 from uni4d_fg.cues.structure.motion import observations_of_tracks, structure_from_motion
@@ -47,6 +49,8 @@ from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
 
+_BLUR_PX = 2
+"""Regions end before what moves does by about this, px, as evidence is blurred."""
 _MOST_MAY_MOVE = 0.6
 """More than this part of the image, or of the tracks, is warned of."""
 
@@ -168,8 +172,7 @@ def _tracks_and_cameras(
         )
     spread = spread_at_tracks(tracks, depths, max(1, round(config.depth_edge_px)))
     labelled = replace(known.labelled, tracks=ideal)
-    outlier = find_outlier_tracks(labelled, intrinsics, config)
-    outlier |= known_moving
+    outlier = find_outlier_tracks(labelled, intrinsics, config, known_moving) | known_moving
     moving = outlier
     cameras, motion = None, None
     for turn in range(config.camera_rounds):
@@ -183,7 +186,7 @@ def _tracks_and_cameras(
             should_stop=stop,
         )
         is_last = turn == config.camera_rounds - 1
-        motion = find_moving_tracks(labelled, spread, cameras, video.image_size, config, with_shared=is_last)
+        motion = find_moving_tracks(labelled, spread, cameras, video.image_size, config, outlier, with_shared=is_last)
         motion = replace(motion, moving=motion.moving | outlier, static=motion.static & ~outlier)
         moving = motion.moving
         report.advance(turn + 1)
@@ -315,8 +318,14 @@ class _Comparison:
                 evidence += weight * warp_back(near[other], flow)
             evidence /= 1 + weight * len(others)
         self._frame(frame)
-        region = moving_region(evidence, self.images[frame], self.video.image_size, self.config)
+        image = self.images[frame]
+        region = moving_region(evidence, image, self.video.image_size, self.config)
         masks: BoolArray = trusted_components(region, self.tracks, self.motion, frame, self.config)
+        if self.config.color_reach_px and len(masks):
+            region = np.asarray(grown(masks, _BLUR_PX).any(axis=0))
+            region = end_at_colors(region, image, self.tracks, self.motion, frame, self.scale, self.config)
+            masks = trusted_components(region, self.tracks, self.motion, frame, self.config)
+        masks = grown(masks, self.config.grow_px)
         return FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
 
     def _gray(self, frame: int) -> ImageArray:

@@ -96,10 +96,15 @@ def trusted_components(
     kept = np.flatnonzero(large & ~denied)
     kept = kept[kept > 0]
     masks: BoolArray = part[None] == kept[:, None, None]
-    if config.grow_px and len(kept):
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * config.grow_px + 1,) * 2)
-        masks = np.stack([cv2.dilate(mask.astype(np.uint8), kernel) > 0 for mask in masks])
     return masks
+
+
+def grown(masks: BoolArray, radius_px: int) -> BoolArray:
+    """Return masks (N, H, W) that reach farther by a radius."""
+    if radius_px == 0 or len(masks) == 0:
+        return masks
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2)
+    return np.stack([cv2.dilate(mask.astype(np.uint8), kernel) > 0 for mask in masks])
 
 
 def _votes(part: np.ndarray, count: int, tracks: Tracks, which: BoolArray, frame: int) -> FloatArray:

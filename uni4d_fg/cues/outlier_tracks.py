@@ -17,20 +17,23 @@ from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import intrinsics_matrix, unproject
 
 
-def find_outlier_tracks(labelled: LabelledTracks, intrinsics: FloatArray, config: MotionMaskConfig) -> BoolArray:
+def find_outlier_tracks(
+    labelled: LabelledTracks, intrinsics: FloatArray, config: MotionMaskConfig, known_moving: BoolArray
+) -> BoolArray:
     """Return (K,) the tracks that disagree with the majority between most pairs of frames in which they are seen.
 
     Args:
         labelled: K tracks with depth; labels and weights are not read.
         intrinsics: (4,) px; roughly right is enough over a few frames.
         config: Its fields ``first_guess_...``.
+        known_moving: (K,) tracks that take no part, as a large thing that moves may be the majority.
     """
     num_tracks, num_frames = labelled.tracks.visible.shape
     agreed, tested = np.zeros(num_tracks), np.zeros(num_tracks)
     step = min(config.first_guess_step, num_frames - 1)
     for source in range(num_frames - step) if step else ():
         target = source + step
-        seen = labelled.tracks.visible[:, source] & labelled.tracks.visible[:, target]
+        seen = labelled.tracks.visible[:, source] & labelled.tracks.visible[:, target] & ~known_moving
         track = np.flatnonzero(seen & np.isfinite(labelled.depth[:, source]))
         if len(track) < config.first_guess_min_tracks:
             continue

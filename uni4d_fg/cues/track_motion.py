@@ -95,6 +95,7 @@ def find_moving_tracks(
     cameras: Cameras,
     image_size: tuple[int, int],
     config: MotionMaskConfig,
+    known_moving: BoolArray,
     with_shared: bool = True,
 ) -> TrackMotion:
     """Test every track against the static scene.
@@ -105,6 +106,7 @@ def find_moving_tracks(
         cameras: Poses of the T frames.
         image_size: (height, width), px.
         config: Baselines, sigmas and thresholds.
+        known_moving: (K,) tracks to which what all share is not fitted, as a large thing would bend it.
         with_shared: Also return what the tracks share of pairs of frames that are compared but not tested.
     """
     num_tracks, num_frames = labelled.tracks.visible.shape
@@ -119,7 +121,7 @@ def find_moving_tracks(
         for sign in (-1, 1)
         if 0 <= i + sign * step < num_frames
     ]
-    scene = _TracksByFrame.of(labelled, spread, cameras)
+    scene = _TracksByFrame.of(labelled, spread, cameras, known_moving)
     for first in range(0, len(pairs), _PAIRS_AT_ONCE):
         some = pairs[first : first + _PAIRS_AT_ONCE]
         seen = [scene.common(*pair, config, tested=abs(pair[1] - pair[0]) in config.track_baselines) for pair in some]
@@ -157,7 +159,7 @@ class _CommonMotion:
     variance: tuple[FloatArray, FloatArray, FloatArray]
     """(n,) each, of x x, x y and y y, px^2."""
     thin: IntArray
-    """Those (m,) to which what all share is fitted."""
+    """Those (m,) to which what all share is fitted: some that may be at rest."""
 
     def squared_departure(self, error: SharedError | None) -> FloatArray:
         """Return the squared departures (n,) in standard deviations, without what the tracks share."""
@@ -166,7 +168,8 @@ class _CommonMotion:
             residual = residual - np.stack(error.at(self.uv[:, 0], self.uv[:, 1]), axis=1)
         squared = mahalanobis(residual[:, 0], residual[:, 1], *self.variance)
         # Tracks of a blurred or fast pair of frames are all worse: what most of them do is noise, not motion.
-        return squared / max(1.0, float(np.median(squared)) / _MEDIAN_OF_CHI2) if len(squared) else squared
+        at_rest = squared[self.thin]
+        return squared / max(1.0, float(np.median(at_rest)) / _MEDIAN_OF_CHI2) if len(at_rest) else squared
 
 
 @dataclass(frozen=True)
@@ -182,9 +185,13 @@ class _TracksByFrame:
     spread: Float32Array
     """(T, K) range of log depth around."""
     cameras: Cameras
+    may_rest: BoolArray
+    """(K,) False for those that are known to move."""
 
     @classmethod
-    def of(cls, labelled: LabelledTracks, spread: Float32Array, cameras: Cameras) -> _TracksByFrame:
+    def of(
+        cls, labelled: LabelledTracks, spread: Float32Array, cameras: Cameras, known_moving: BoolArray
+    ) -> _TracksByFrame:
         """Return tracks by frame."""
         return cls(
             np.ascontiguousarray(labelled.tracks.visible.T),
@@ -192,6 +199,7 @@ class _TracksByFrame:
             np.ascontiguousarray(labelled.depth.T),
             np.ascontiguousarray(spread.T),
             cameras,
+            ~known_moving,
         )
 
     def common(self, source: int, target: int, config: MotionMaskConfig, tested: bool) -> _CommonMotion:
@@ -210,7 +218,8 @@ class _TracksByFrame:
             nothing = np.zeros(0)
             return _CommonMotion(seen[:0], np.zeros((0, 2)), np.zeros((0, 2)), (nothing,) * 3, seen[:0])
         usual = np.median(depth[known]) if not known.all() else 1.0
-        thin = evenly_spread(len(seen), config.shared_max_tracks)
+        rest = np.flatnonzero(self.may_rest[seen])
+        thin = rest[evenly_spread(len(rest), config.shared_max_tracks)]
         if not tested:
             seen, depth, known, thin = seen[thin], depth[thin], known[thin], np.arange(len(thin))
         uv, uv_target = (self.uv[frame, seen].astype(np.float64) for frame in (source, target))
@@ -244,7 +253,7 @@ def _fit_shared(
 ) -> list[SharedError | None]:
     """Fit a quadratic to the residuals of each pair of frames by reweighted least squares; None with too few tracks."""
     height, width = size
-    fitted = [n for n, motion in enumerate(motions) if len(motion.track) >= config.shared_min_tracks]
+    fitted = [n for n, motion in enumerate(motions) if len(motion.thin) >= config.shared_min_tracks]
     count = np.array([len(motions[n].thin) for n in fitted], dtype=np.int64)
     if not fitted:
         return [None] * len(motions)

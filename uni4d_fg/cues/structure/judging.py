@@ -9,12 +9,10 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.selection import picture_cells
-from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
-from uni4d_fg.geometry.camera import NEAR_PLANE, project, unproject, world_to_camera
+from uni4d_fg.cues.structure.triangulation import RayBundle, directions_far_away, triangulate
+from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.slam.stages.observations import Observations
 
-_FAR = 1e5
-"""Points at infinity are so many times farther than the cameras are apart."""
 _LOST = 100.0
 """Errors, in sigmas, are cut here."""
 
@@ -103,22 +101,7 @@ def _points_of_all(scene: GrowingScene) -> FloatArray:
     seen = scene.observations.select(rays)
     bundle = RayBundle(scene.row[rays], scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, scene.num_tracks)
     near = triangulate(bundle, scene.config.geometric_depth.triangulation_huber_px)
-    far = _at_infinity(bundle)
-    for points in (near.position, far):
+    for points in (near.position, directions_far_away(bundle)):
         still = ~np.isfinite(position[:, 0]) & missing
         position[still] = points[still]
     return position
-
-
-def _at_infinity(rays: RayBundle) -> FloatArray:
-    """Return points (M, 3) in the mean direction of the rays of each track, too far to show parallax; NaN without."""
-    in_camera = unproject(rays.intrinsics, rays.uv, np.ones(len(rays.uv)))
-    in_camera /= np.linalg.norm(in_camera, axis=1, keepdims=True)
-    direction = (rays.world_T_cam[rays.frame, :3, :3] @ in_camera[..., None])[..., 0]
-    total = np.stack([np.bincount(rays.row, direction[:, a], rays.count) for a in range(3)], axis=1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    centers = rays.world_T_cam[np.unique(rays.frame), :3, 3]
-    distance = _FAR * max(float(np.linalg.norm(np.ptp(centers, axis=0))), NEAR_PLANE)
-    with np.errstate(invalid="ignore"):
-        result: FloatArray = centers.mean(axis=0) + distance * total / np.where(length > 0, length, np.nan)
-    return result

@@ -22,7 +22,14 @@ from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.self_calibration import focal_of_pairs
-from uni4d_fg.cues.structure.triangulation import Points, RayBundle, triangulate
+from uni4d_fg.cues.structure.triangulation import (
+    Points,
+    RayBundle,
+    directions_far_away,
+    median_per_row,
+    reprojection_errors,
+    triangulate,
+)  # fmt: skip
 from uni4d_fg.cues.structure.trimming import trim_and_converge
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled, SolverError
@@ -305,5 +312,17 @@ def _triangulate_all(
     points = points.replaced(again, triangulate(rays.select(fits & again[row]), huber_px))
     with np.errstate(invalid="ignore"):
         wrong = ~(points.error_px <= limit)
+    # Rays that part meet behind the cameras: that of nothing that is at rest, unless they are all but parallel.
+    parting = ~np.isfinite(points.error_px)
+    far = rays.select(parting[row])
+    moving |= parting & (_median_error_far_away(far) > limit)
     points.position[wrong | moving] = np.nan
     return tracks, points, moving
+
+
+def _median_error_far_away(rays: RayBundle) -> FloatArray:
+    """Return the median reprojection error (M,) px of points too far to show parallax; 0 for tracks without a ray."""
+    position = directions_far_away(rays)
+    error = median_per_row(reprojection_errors(rays, position), rays.row, rays.count)
+    result: FloatArray = np.where(np.isnan(error), 0.0, error)
+    return result

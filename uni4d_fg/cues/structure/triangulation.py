@@ -24,6 +24,7 @@ from uni4d_fg.geometry.camera import (
     inverse_depth_slope,
     project,
     seen_from,
+    unproject,
     world_to_camera,
 )
 from uni4d_fg.optim.extension import find_extension
@@ -32,6 +33,8 @@ from uni4d_fg.optim.threads import thread_count
 _STEPS = 8
 _RIDGE = 1e-9
 """Part of the trace that makes a matrix safe to invert; rays with a smaller eigenvalue are parallel."""
+_FAR = 1e5
+"""Points far away are so many times farther than the cameras are apart."""
 _CONVERGED = 1e-5
 """A step below this part of the distance ends the refinement of a point."""
 
@@ -140,6 +143,21 @@ def _start(matrix: FloatArray, right: FloatArray) -> FloatArray:
     position = np.full((len(matrix), 3), np.nan)
     position[solvable] = np.linalg.solve(matrix[solvable], right[solvable][..., None])[..., 0]
     return position
+
+
+def directions_far_away(rays: RayBundle) -> FloatArray:
+    """Return points (M, 3) in the mean direction of the rays of each track, too far to show parallax; NaN without."""
+    in_camera = unproject(rays.intrinsics, rays.uv, np.ones(len(rays.uv)))
+    in_camera /= np.linalg.norm(in_camera, axis=1, keepdims=True)
+    direction = (rays.world_T_cam[rays.frame, :3, :3] @ in_camera[..., None])[..., 0]
+    total = np.stack([np.bincount(rays.row, direction[:, a], rays.count) for a in range(3)], axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    centers = rays.world_T_cam[np.unique(rays.frame), :3, 3].reshape(-1, 3)
+    if len(centers) == 0:
+        return np.full((rays.count, 3), np.nan)
+    distance = _FAR * max(float(np.linalg.norm(np.ptp(centers, axis=0))), NEAR_PLANE)
+    result: FloatArray = centers.mean(axis=0) + distance * total / np.where(length > 0, length, np.nan)
+    return result
 
 
 def sound(points: Points, max_error_px: float, min_angle_deg: float) -> BoolArray:
