@@ -168,6 +168,16 @@ def test_things_that_were_apart_stay_so_where_they_touch(first_touch: int, stay_
         assert (result[-1][inside] == number).mean() > 0.95
 
 
+def test_a_thing_that_left_while_another_region_covers_its_place_parts_nothing() -> None:
+    """Two were apart; one leaves the picture: the other's region stays whole, and no empty one is made of it."""
+    leaves: list[tuple[int, int] | None] = [(30, 120 + 6 * t) for t in range(6)]
+    scene = Scene({1: [(30, 20)] * 12, 2: [*leaves, *[None] * 6]})
+    result = associate(scene, [components((labels > 0).astype(np.int32)) for labels in scene.truth], join_parts=True)
+    first = numbers_of(result, scene.truth, 1)
+    assert set(first) == {first[0]}
+    assert len(np.unique(result[result > 0])) == 2
+
+
 def test_a_class_map_falls_into_its_connected_regions() -> None:
     classes = np.zeros(SIZE, np.int32)
     classes[5:20, 5:20], classes[5:20, 20:30], classes[40:60, 40:60], classes[90, 90] = 3, 4, 3, 3

@@ -40,14 +40,13 @@ def with_cameras(tracks: TrackedScene, turned: float = 0.0) -> GrowingScene:
     return scene
 
 
-def start(
-    errors_px: list[float], noise_px: float = 0.2, is_usual: bool = True, pair: FramePair = PAIR, misfit: float = 0.0
-) -> Hypothesis:
+def start(errors_px: list[float], noise_px: float = 0.2, is_usual: bool = True, pair: FramePair = PAIR) -> Hypothesis:
     """A start with given errors of what was held out, alike in weight."""
     error = np.array(errors_px)
     scene = scene_of(tracked(sideways(FRAMES), 4, points=20))
     judged = HeldOut(error, np.ones(len(error)))
-    return Hypothesis(pair, "majority", scene, np.arange(FRAMES), judged, noise_px, is_usual, 0.0, misfit)
+    left = judged.unexplained(CONFIG.geometric_depth.max_reprojection_px)
+    return Hypothesis(pair, "majority", scene, np.arange(FRAMES), judged, noise_px, is_usual, left, left)
 
 
 def competition_of(tracks: TrackedScene, guess: FocalGuess | None = None) -> Competition:
@@ -108,6 +107,12 @@ def test_the_noise_of_tracks_is_not_told_by_a_start_that_explains_few() -> None:
     assert best.misfit == pytest.approx((16 * (0.2 / 0.6) ** 2 + 4) / 20)
     assert ranked([few])[0].misfit == pytest.approx(few.held_out.unexplained(4.0))
     assert other.misfit > best.misfit
+
+
+def test_exact_tracks_are_judged_as_those_of_the_least_noise_that_is_believed() -> None:
+    floor = CONFIG.bundle_adjustment.min_reprojection_sigma_px
+    (best,) = ranked([start([0.0] * 10 + [1e-9] * 5 + [floor] * 5, noise_px=0.0)])
+    assert best.misfit == pytest.approx(5 * (1 / 3) ** 2 / 20)
 
 
 def test_cameras_that_only_turn_explain_tracks_without_points() -> None:

@@ -1,7 +1,8 @@
 """From what is found in each frame alone to instances that keep their number over the video.
 
 An instance of the last frame is warped to the new one by optical flow and compared with the new detections; the
-assignment of least total cost (Hungarian method) on intersection over union continues it. An instance that is not
+assignment of least total cost (Hungarian method) on intersection over union continues it. A region found by motion may
+hold several things that were apart before: it is parted among them. An instance that is not
 found is moved on by its last velocity for a few frames, so that it keeps its number when it comes back from behind
 something: the flow there is that of what hides it.
 """
@@ -152,7 +153,7 @@ def _parted(
     found: FrameDetections, instances: list[_Instance], size: tuple[int, int], config: InstanceConfig
 ) -> FrameDetections:
     """Part regions in which several things lie that were apart before: every pixel goes to the nearest of them."""
-    known = [i for i in instances if not i.missed and i.apart >= config.min_apart_frames]
+    known = [i for i in instances if not i.missed and i.apart >= config.min_apart_frames and bool((i.mask > 0.5).any())]
     if len(known) < 2 or not len(found):
         return found
     masks, classes, scores = [], [], []
@@ -164,7 +165,7 @@ def _parted(
             nearest = np.argmin([_distance(i.mask > 0.5) for i in inside], axis=0).astype(np.uint8)
             full = cv2.resize(nearest, mask.shape[::-1], interpolation=cv2.INTER_NEAREST)
             pieces = [mask & (full == n) for n in range(len(inside))]
-        for piece in pieces:
+        for piece in filter(np.any, pieces):
             masks.append(piece)
             classes.append(class_id)
             scores.append(score)

@@ -49,8 +49,6 @@ from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
 
-_BLUR_PX = 2
-"""Regions end before what moves does by about this, px, as evidence is blurred."""
 _MOST_MAY_MOVE = 0.6
 """More than this part of the image, or of the tracks, is warned of."""
 
@@ -320,13 +318,13 @@ class _Comparison:
         self._frame(frame)
         image = self.images[frame]
         region = moving_region(evidence, image, self.video.image_size, self.config)
-        masks: BoolArray = trusted_components(region, self.tracks, self.motion, frame, self.config)
-        if self.config.color_reach_px and len(masks):
-            region = np.asarray(grown(masks, _BLUR_PX).any(axis=0))
-            region = end_at_colors(region, image, self.tracks, self.motion, frame, self.scale, self.config)
-            masks = trusted_components(region, self.tracks, self.motion, frame, self.config)
-        masks = grown(masks, self.config.grow_px)
+        region = np.asarray(self._trusted(region, frame).any(axis=0))
+        region = end_at_colors(region, image, self.tracks, self.motion, frame, self.scale, self.config)
+        masks = grown(self._trusted(region, frame), self.config.grow_px)
         return FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
+
+    def _trusted(self, region: BoolArray, frame: int) -> BoolArray:
+        return trusted_components(region, self.tracks, self.motion, frame, self.config)
 
     def _gray(self, frame: int) -> ImageArray:
         self._frame(frame)

@@ -95,8 +95,7 @@ def trusted_components(
     denied = votes[1] > config.max_static_fraction * (votes[0] + votes[1])
     kept = np.flatnonzero(large & ~denied)
     kept = kept[kept > 0]
-    masks: BoolArray = part[None] == kept[:, None, None]
-    return masks
+    return np.asarray(part[None] == kept[:, None, None])
 
 
 def grown(masks: BoolArray, radius_px: int) -> BoolArray:

@@ -16,6 +16,8 @@ from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.track_motion import TrackMotion
 from uni4d_fg.frontend.track_model import Tracks
 
+_BLUR_PX = 2
+"""Regions end before what moves does by about this, image px, as evidence is blurred."""
 _SEED = 0
 """OpenCV draws the first means of the color models: from the same state in every frame."""
 
@@ -41,11 +43,11 @@ def end_at_colors(
         config: Its fields ``color_...``, in working pixels.
     """
     size = image.shape[:2]
-    small = cv2.resize(region.astype(np.uint8), (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
-    reach = config.color_reach_px
-    near = cv2.dilate(small, _disk(reach))
-    if not small.any() or reach == 0:
+    wide = cv2.dilate(region.astype(np.uint8), _disk(_BLUR_PX))
+    small = cv2.resize(wide, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
+    if not small.any() or config.color_reach_px == 0:
         return region
+    near = cv2.dilate(small, _disk(config.color_reach_px))
     label = np.full(size, cv2.GC_BGD, np.uint8)
     label[near > 0] = cv2.GC_PR_BGD
     label[small > 0] = cv2.GC_PR_FGD

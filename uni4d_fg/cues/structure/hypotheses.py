@@ -162,9 +162,12 @@ class Competition:
             return None
         focal = scene.mean_focal / max(self.image_size)
         is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
-        judgement = HeldOut.of(scene, judged.select(kept_out), self.image_size)
-        left = judgement.unexplained(settings.max_reprojection_px)
-        return Hypothesis(pair, part, scene, frames, judgement, scene.noise_of_good(), is_usual, left, left)
+        kept = HeldOut.of(scene, judged.select(kept_out), self.image_size)
+        left = kept.unexplained(settings.max_reprojection_px)
+        return Hypothesis(
+            pair, part, scene, frames, held_out=kept, noise_px=scene.noise_of_good(), is_usual=is_usual,
+            unexplained=left, misfit=left,
+        )  # fmt: skip
 
     def _picked(self, frames: IntArray) -> tuple[IntArray, Observations, BoolArray]:
         """Return the observations (n,) that trials on some frames use, in full as well, and which (n,) are held out."""
@@ -187,12 +190,12 @@ def ranked(found: list[Hypothesis]) -> list[Hypothesis]:
     is the least that a start has which explains enough.
     """
     sharp = [one.noise_px for one in found if one.held_out.share_within(_SIGMAS * one.noise_px) >= _ENOUGH]
-    limit = _SIGMAS * min(sharp) if sharp else np.inf
-    judged = [
-        replace(one, misfit=one.held_out.unexplained(min(limit, one.scene.config.geometric_depth.max_reprojection_px)))
-        for one in found
-    ]
-    return sorted(judged, key=lambda one: one.cost)
+    if sharp:
+        config = found[0].scene.config
+        noise = max(min(sharp), config.bundle_adjustment.min_reprojection_sigma_px)  # tracks may be exact
+        limit = min(_SIGMAS * noise, config.geometric_depth.max_reprojection_px)
+        found = [replace(one, misfit=one.held_out.unexplained(limit)) for one in found]
+    return sorted(found, key=lambda one: one.cost)
 
 
 def trial_frames(pair: FramePair, num_frames: int, steps: int, count: int) -> IntArray:
