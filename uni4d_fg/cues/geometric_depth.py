@@ -168,6 +168,7 @@ def _with_maps(
         f"frames posed, {triangulated} of {len(structure.track)} static tracks triangulated, "
         f"noise {structure.sigma_px:.2f} px, fx {fx:.1f} fy {fy:.1f} px",
         *structure.camera.facts(),
+        *_reading(structure),
         f"scale by convention: median depth of the first frame is {settings.median_depth:g}",
         f"focal length between {structure.focal.low:.0f} and {structure.focal.high:.0f} px (95 %); the cameras explain "
         f"{100 * (1.0 - structure.unexplained):.0f} % of what was held out",
@@ -273,6 +274,16 @@ def _points_per_frame(
         return with_borrowed(points[frame], positions, pose, structure.camera, frame, size, config)
 
     return tuple(map_in_order(of_frame, list(range(num_frames)), thread_count()))
+
+
+def _reading(structure: Structure) -> list[str]:
+    if structure.readout is None:
+        return []
+    return [
+        f"reading {structure.readout.axis} takes {abs(structure.readout.seconds):.2f} of the time between two frames: "
+        "focal length and lens are those of tracks at the time of the middle one (camera.rolling_shutter=auto solves "
+        "the cameras on them, too)"
+    ]
 
 
 def _place(

@@ -120,7 +120,7 @@ def find_camera(
     """
     settings = config.camera
     sharp = sharp_frames(blur_px, len(scene.registered))
-    part = _part_of(scene, settings.observations, sharp)
+    part = part_of(scene, settings.observations, sharp)
     if not part.good.any():
         return None
     plain = _Fitted(CameraModel(part.intrinsics), part)
@@ -147,7 +147,7 @@ def find_camera(
     return None if best is plain else FoundCamera(best.camera, gain)
 
 
-def _part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> GrowingScene:
+def part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> GrowingScene:
     """Return the scene with evenly spread tracks that have about so many observations together, in some of (T,)."""
     seen = scene.observations.select(frames[scene.observations.frame])
     _, row = seen.rows()
@@ -161,15 +161,15 @@ def _part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> Growi
 
 
 def _scene_of(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
-    """Return a scene of other observations with the cameras of one that is grown, trimmed."""
-    scene = _triangulated(ideal, cameras)
+    """Return what the cameras of a scene see of other observations, trimmed."""
+    scene = seen_by(cameras, ideal)
     trim(scene)
     scene.measure_noise()
     return scene
 
 
-def _triangulated(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
-    """Return what the cameras of a scene see of other observations."""
+def seen_by(cameras: GrowingScene, ideal: Observations) -> GrowingScene:
+    """Return a scene of other observations with the cameras of one that is grown."""
     scene = GrowingScene.empty(
         ideal.with_min_observations(2), len(cameras.registered), cameras.intrinsics, cameras.config,
         free_focal=cameras.free_focal, prior_intrinsics=cameras.prior_intrinsics, should_stop=cameras.should_stop,
@@ -189,7 +189,7 @@ class _Judge:
     def energies(self, fitted: _Fitted) -> FloatArray:
         """Return the mean robust energy (K,) of each track on real pixels; NaN where its rays are too parallel."""
         tracks, _ = self.real.rows()
-        scene = _triangulated(fitted.camera.ideal_observations(self.real), fitted.scene)
+        scene = seen_by(fitted.scene, fitted.camera.ideal_observations(self.real))
         seen = scene.observations
         size = fitted.camera.ideal_weight(seen.uv, seen.frame)
         error = np.minimum(scene.errors() * np.sqrt(size) / self.sigma_px, _LOST)
@@ -318,7 +318,7 @@ def _find_zoom(
         start = grown(camera.ideal_observations(real), camera.intrinsics)
         if start is None:
             return found
-        part = _part_of(start, settings.observations, plain.scene.registered)
+        part = part_of(start, settings.observations, plain.scene.registered)
         part.free_focal = scene.free_focal
         found = _free_zoom(_Fitted(camera, part), config, to_the_end)
         assert camera.zoom is not None

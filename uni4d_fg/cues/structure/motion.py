@@ -18,6 +18,7 @@ from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
+from uni4d_fg.cues.structure.readout import at_one_time, find_readout
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
@@ -36,6 +37,7 @@ from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.rolling_shutter import Readout
 from uni4d_fg.slam.lens.strength import Strength
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -73,6 +75,9 @@ class Structure:
     :class:`~uni4d_fg.cues.structure.judging.HeldOut`."""
     rivals: list[Rival]
     """Starts that explain them nearly as well."""
+    readout: Readout | None = None
+    """How images are read, in units of the time between two; None where all rows are read at once. Cameras and points
+    are then those of the middle rows."""
 
     @property
     def intrinsics(self) -> FloatArray:
@@ -139,9 +144,16 @@ def structure_from_motion(
     if grown is None:
         return None
     beside: list[float] = []  # focal lengths, px, of cameras that explain the tracks nearly as well
+    readout = None
     if any_camera and free_focal:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
+        readout = find_readout(grown.scene, observations, image_size)
+        if readout is not None:
+            moved = at_one_time(observations, readout, image_size)
+            again = quiet.grow(moved, camera.intrinsics, free_focal)
+            if again is not None:
+                grown, observations = again, moved
         try:
             found = find_camera(
                 grown.scene, observations, image_size, config,
@@ -189,7 +201,7 @@ def structure_from_motion(
     reporter.end()
     return Structure(
         poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, sigma, best.pair,
-        focal, focal_sigma, best.unexplained, rivals,
+        focal, focal_sigma, best.unexplained, rivals, readout,
     )  # fmt: skip
 
 

@@ -1,8 +1,9 @@
 """Whether the images of a video are read row by row, and how fast, from its tracks.
 
 Bundle adjustment of part of the static tracks, moved to where they were at one time
-(:mod:`uni4d_fg.slam.lens.rolling_shutter`), is repeated for several times of readout. Near its minimum its energy is
-close to a parabola in that time; the part of the reprojection energy that goes away at its minimum is the evidence.
+(:mod:`uni4d_fg.slam.lens.rolling_shutter`), is repeated for several times of readout
+(:mod:`uni4d_fg.slam.lens.readout_search`); the part of the reprojection energy that goes away at its minimum is the
+evidence.
 """
 
 from __future__ import annotations
@@ -21,18 +22,12 @@ from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import LensFit
+from uni4d_fg.slam.lens.readout_search import least_readout
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout, at_one_time
 from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample
 from uni4d_fg.slam.stages.acceleration import frame_interval
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem, near_the_minimum
 from uni4d_fg.slam.stages.scene import StaticScene
-
-_FIRST, _OUTWARD = 0.3, 2.2
-"""Of the time between two frames: the first readout that is tried, and the factor to the next where it is the best."""
-_LONGEST = 1.0
-"""No image is read longer than until the next."""
-_PARABOLAS, _NEAR = 3, 0.02
-"""Readouts that are nearer than this part of the time between two frames to one that was tried are not."""
 
 
 @dataclass(frozen=True)
@@ -115,30 +110,12 @@ class ReadoutFit:
         return self._solved[readout].final_energy
 
     def _along(self, axis: Axis, interval: float) -> Readout | None:
-        """Return the best readout along an axis, by successive parabolas."""
-        first, end = _FIRST * interval, _LONGEST * interval
-        tried = {0.0: self.energy(None)}
-        tried |= {seconds: self.energy(Readout(seconds, axis)) for seconds in (-first, first)}
-        while True:  # the best so far is to lie between others: outward, as far as a shutter goes
-            best = min(tried, key=tried.__getitem__)
-            if best not in (min(tried), max(tried)) or abs(best) >= end:
-                break
-            farther = float(np.clip(_OUTWARD * best, -end, end))
-            tried[farther] = self.energy(Readout(farther, axis))
-        for _ in range(_PARABOLAS):
-            # Of the best and those beside it: farther ones are no parabola's.
-            at = sorted(tried)
-            middle = int(np.clip(at.index(min(tried, key=tried.__getitem__)), 1, len(at) - 2))
-            beside = at[middle - 1 : middle + 2]
-            curve = np.polyfit(np.array(beside) / interval, [tried[seconds] for seconds in beside], 2)
-            if not curve[0] > 0.0:
-                break
-            lowest = float(np.clip(-0.5 * curve[1] / curve[0] * interval, -end, end))
-            if min(abs(lowest - seconds) for seconds in tried) < _NEAR * interval:
-                break
-            tried[lowest] = self.energy(Readout(lowest, axis))
-        best = min(tried, key=tried.__getitem__)
-        return Readout(best, axis) if best else None
+        """Return the best readout along an axis."""
+
+        def readout(part: float) -> Readout | None:
+            return Readout(part * interval, axis) if part else None
+
+        return readout(least_readout(lambda part: self.energy(readout(part))))
 
     def _at(self, readout: Readout | None) -> LabelledTracks:
         """Return the chosen tracks in the chosen frames, with a readout undone, and a lens and a zoom if known."""
