@@ -11,6 +11,7 @@ from cues.start_scenes import GUESS, SIZE, K, TrackedScene
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
 from uni4d_fg.cues.structure.readout import at_one_time
+from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.progress import SilentReporter
@@ -88,6 +89,18 @@ def test_images_that_are_read_at_once_are_not_taken_for_others(seed: int) -> Non
 def test_readouts_beyond_what_a_shutter_takes_are_not_believed() -> None:
     structure, _ = found(read_by(Readout(1.6)))
     assert structure.readout is None
+
+
+def test_a_search_that_cannot_be_solved_leaves_the_scene_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise SolverError("singular")
+
+    scene = read_by(Readout(0.5))
+    monkeypatch.setattr("uni4d_fg.cues.structure.motion.find_readout", fails)
+    structure, _ = found(scene)
+    assert structure.readout is None
+    plain, _ = found(scene, any_camera=False)
+    assert structure.sigma_px <= 1.1 * plain.sigma_px
 
 
 @pytest.mark.parametrize("least", [0.0, 0.13, -0.47, 0.85])

@@ -148,12 +148,7 @@ def structure_from_motion(
     if any_camera and free_focal:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
-        readout = find_readout(grown.scene, observations, image_size)
-        if readout is not None:
-            moved = at_one_time(observations, readout, image_size)
-            again = quiet.grow(moved, camera.intrinsics, free_focal)
-            if again is not None:
-                grown, observations = again, moved
+        grown, observations, readout = quiet.at_one_time(grown, observations, camera.intrinsics)
         try:
             found = find_camera(
                 grown.scene, observations, image_size, config,
@@ -247,6 +242,24 @@ class _Search:
         grow(scene, self.reporter)
         trim_and_converge(scene)
         return _Grown(nearer_to_the_tracks(scene), hypotheses)
+
+    def at_one_time(
+        self, grown: _Grown, observations: Observations, intrinsics: FloatArray
+    ) -> tuple[_Grown, Observations, Readout | None]:
+        """Return a scene of tracks at the time of the middle row, these, and the readout; where none is told, as given.
+
+        The focal lengths are free.
+        """
+        try:
+            readout = find_readout(grown.scene, observations, self.image_size)
+            if readout is not None:
+                moved = at_one_time(observations, readout, self.image_size)
+                again = self.grow(moved, intrinsics, free_focal=True)
+                if again is not None:
+                    return again, moved, readout
+        except SolverError:  # The scene of the tracks as they are is no worse for it.
+            pass
+        return grown, observations, None
 
     def holding_rivals(self, focal: FocalInterval, rivals: list[Rival]) -> FocalInterval:
         """Return an interval that also holds the focal lengths of other starts, as far as cameras have such ones."""
