@@ -46,7 +46,7 @@ def start(errors_px: list[float], noise_px: float = 0.2, is_usual: bool = True, 
     scene = scene_of(tracked(sideways(FRAMES), 4, points=20))
     judged = HeldOut(error, np.ones(len(error)))
     left = judged.unexplained(CONFIG.geometric_depth.max_reprojection_px)
-    return Hypothesis(pair, "majority", scene, np.arange(FRAMES), judged, noise_px, is_usual, left, left)
+    return Hypothesis(pair, "majority", scene, np.arange(FRAMES), judged, noise_px, is_usual, left)
 
 
 def competition_of(tracks: TrackedScene, guess: FocalGuess | None = None) -> Competition:

@@ -59,10 +59,13 @@ class Hypothesis:
     """Noise of the tracks that it agrees with."""
     is_usual: bool
     """Whether its focal length is one that cameras have."""
-    unexplained: float
-    """Part of the held-out observations that errs by more than points may, see ``max_reprojection_px``."""
     misfit: float
-    """Part that errs by more than the noise of the tracks, see :func:`ranked`."""
+    """Part of the held-out observations that errs by more than the noise of the tracks, see :func:`ranked`."""
+
+    @property
+    def unexplained(self) -> float:
+        """Part of them that errs by more than points may, see ``max_reprojection_px``."""
+        return self.held_out.unexplained(self.scene.config.geometric_depth.max_reprojection_px)
 
     @property
     def cost(self) -> float:
@@ -84,7 +87,7 @@ class Competition:
     free_focal: bool
     should_stop: Callable[[], bool]
     guess: FocalGuess | None = None
-    """What pairs of frames tell of the focal length; None if nothing."""
+    """What pairs of frames tell of the focal length; None if nothing, or if it is not sought."""
     picked: dict[tuple[int, ...], tuple[IntArray, Observations, BoolArray]] = field(default_factory=dict)
     """What trials on the same frames share."""
 
@@ -112,7 +115,7 @@ class Competition:
     def factors(self) -> list[float]:
         """Return the focal lengths to start from, as parts of the given ones; that for all pairs first."""
         starts = [1.0, *(factor for factor in self.config.geometric_depth.focal_starts if factor != 1.0)]
-        if self.guess is None or not self.free_focal:
+        if self.guess is None:
             return starts
         told = self.guess.focal / float(np.mean(self.intrinsics[:2]))
         return [told, *starts] if self.guess.is_agreed else [*starts, told]
@@ -163,10 +166,9 @@ class Competition:
         focal = scene.mean_focal / max(self.image_size)
         is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
         kept = HeldOut.of(scene, judged.select(kept_out), self.image_size)
-        left = kept.unexplained(settings.max_reprojection_px)
         return Hypothesis(
             pair, part, scene, frames, held_out=kept, noise_px=scene.noise_of_good(), is_usual=is_usual,
-            unexplained=left, misfit=left,
+            misfit=kept.unexplained(settings.max_reprojection_px),
         )  # fmt: skip
 
     def _picked(self, frames: IntArray) -> tuple[IntArray, Observations, BoolArray]:

@@ -47,8 +47,8 @@ def find_readout(scene: GrowingScene, observations: Observations, image_size: tu
     if not part.good.any():
         return None
     rows = _rows_of(part.observations, observations)
-    motion = [values[rows] for values in _motion(observations)]
-    trials = _Trials(part, motion[0], motion[1], image_size)
+    velocity, acceleration = (values[rows] for values in _motion(observations))
+    trials = _Trials(part, velocity, acceleration, image_size)
     least = scene.config.camera.min_readout_evidence
     likely = [axis for axis in _AXES if trials.gain_at_first(axis) >= 0.5 * least]
     if not likely:
@@ -66,16 +66,7 @@ def at_one_time(observations: Observations, readout: Readout, image_size: tuple[
         readout: In units of the time between two frames.
         image_size: (height, width), px.
     """
-    velocity, acceleration = _motion(observations)
-    return replace(observations, uv=_moved(observations.uv, velocity, acceleration, readout, image_size))
-
-
-def _moved(
-    uv: FloatArray, velocity: FloatArray, acceleration: FloatArray, readout: Readout, image_size: tuple[int, int]
-) -> FloatArray:
-    delay = readout.delay(uv, image_size)[:, None]
-    result: FloatArray = uv - delay * velocity + 0.5 * delay**2 * acceleration
-    return result
+    return replace(observations, uv=readout.undone(observations.uv, *_motion(observations), image_size))
 
 
 def _motion(observations: Observations) -> tuple[FloatArray, FloatArray]:
@@ -126,7 +117,7 @@ class _Trials:
         readout = readout if readout.seconds else Readout(0.0)  # along whatever axis
         if readout not in self.known:
             seen = self.scene.observations
-            uv = _moved(seen.uv, self.velocity, self.acceleration, readout, self.image_size)
+            uv = readout.undone(seen.uv, self.velocity, self.acceleration, self.image_size)
             scene = seen_by(self.scene, replace(seen, uv=uv))
             scene.measure_noise()
             scene.adjust(_SOLVED)

@@ -33,6 +33,14 @@ class Readout:
         along, size = (uv[..., 1], image_size[0]) if self.axis == "rows" else (uv[..., 0], image_size[1])
         return np.asarray(self.seconds * (along / max(size - 1, 1) - 0.5))
 
+    def undone(
+        self, uv: FloatArray, velocity: FloatArray, acceleration: FloatArray, image_size: tuple[int, int]
+    ) -> FloatArray:
+        """Return where pixels (..., 2) that move like that are when the middle of their image is read."""
+        delay = self.delay(uv, image_size)[..., None]
+        result: FloatArray = uv - delay * velocity + 0.5 * delay**2 * acceleration
+        return result
+
 
 def at_one_time(
     labelled: LabelledTracks, readout: Readout, timestamps: FloatArray, image_size: tuple[int, int]
@@ -50,9 +58,7 @@ def at_one_time(
     """
     tracks = labelled.tracks
     uv = tracks.uv.astype(np.float64)
-    delay = readout.delay(uv, image_size)[..., None]
-    velocity, acceleration = _motion(uv, tracks.visible, timestamps)
-    moved = uv - delay * velocity + 0.5 * delay**2 * acceleration
+    moved = readout.undone(uv, *_motion(uv, tracks.visible, timestamps), image_size)
     return replace(labelled, tracks=replace(tracks, uv=moved.astype(np.float32)))
 
 
