@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.guided_filter import guided_filter
 from uni4d_fg.cues.track_motion import TrackMotion
@@ -47,12 +48,16 @@ def _splat(
     tracks: Tracks, which: BoolArray, frame: int, size: tuple[int, int], scale: FloatArray, reach_px: float
 ) -> Float32Array:
     seen = which & tracks.visible[:, frame]
-    uv = (tracks.uv[seen, frame] + 0.5) * scale
-    column, row = uv.astype(np.int64).T
     image = np.zeros(size, np.float32)
-    np.add.at(image, (np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)), np.float32(1))
+    np.add.at(image, working_pixels(tracks.uv[seen, frame], size, scale), np.float32(1))
     peak = 2 * np.pi * reach_px**2
     return np.asarray(cv2.GaussianBlur(image, (0, 0), reach_px) * np.float32(peak))
+
+
+def working_pixels(uv: Float32Array, size: tuple[int, int], scale: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return rows and columns (N,) at working size (h, w) of image pixels (N, 2); ``scale`` as above."""
+    column, row = ((uv + 0.5) * scale).astype(np.int64).T
+    return np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)
 
 
 def moving_region(
@@ -102,8 +107,12 @@ def grown(masks: BoolArray, radius_px: int) -> BoolArray:
     """Return masks (N, H, W) that reach farther by a radius."""
     if radius_px == 0 or len(masks) == 0:
         return masks
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2)
-    return np.stack([cv2.dilate(mask.astype(np.uint8), kernel) > 0 for mask in masks])
+    return np.stack([cv2.dilate(mask.astype(np.uint8), disk(radius_px)) > 0 for mask in masks])
+
+
+def disk(radius_px: int) -> npt.NDArray[np.uint8]:
+    """Return the kernel with which masks grow and shrink by a radius."""
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2), np.uint8)
 
 
 def _votes(part: np.ndarray, count: int, tracks: Tracks, which: BoolArray, frame: int) -> FloatArray:

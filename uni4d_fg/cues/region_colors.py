@@ -13,6 +13,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.cues.moving_regions import disk, working_pixels
 from uni4d_fg.cues.track_motion import TrackMotion
 from uni4d_fg.frontend.track_model import Tracks
 
@@ -43,41 +44,33 @@ def end_at_colors(
         config: Its fields ``color_...``, in working pixels.
     """
     size = image.shape[:2]
-    wide = cv2.dilate(region.astype(np.uint8), _disk(_BLUR_PX))
+    wide = cv2.dilate(region.astype(np.uint8), disk(_BLUR_PX))
     small = cv2.resize(wide, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     if not small.any() or config.color_reach_px == 0:
         return region
-    near = cv2.dilate(small, _disk(config.color_reach_px))
+    near = cv2.dilate(small, disk(config.color_reach_px))
     label = np.full(size, cv2.GC_BGD, np.uint8)
     label[near > 0] = cv2.GC_PR_BGD
     label[small > 0] = cv2.GC_PR_FGD
-    label[cv2.erode(small, _disk(config.color_core_px)) > 0] = cv2.GC_FGD
-    at_rest = _around(tracks.uv[motion.static & tracks.visible[:, frame], frame], size, scale, config.color_track_px)
-    label[at_rest & (small == 0)] = cv2.GC_BGD
+    label[cv2.erode(small, disk(config.color_core_px)) > 0] = cv2.GC_FGD
+    at_rest = np.zeros(size, np.uint8)
+    at_rest[working_pixels(tracks.uv[motion.static & tracks.visible[:, frame], frame], size, scale)] = 1
+    label[(cv2.dilate(at_rest, disk(config.color_track_px)) > 0) & (small == 0)] = cv2.GC_BGD
     part = _around_region(near, config.color_margin_px)
     inside = label[part].copy()
-    moves = (inside == cv2.GC_FGD) | (inside == cv2.GC_PR_FGD)
-    if moves.all():  # no other color to tell them from
+    if _moves(inside).all():  # no other color to tell them from
         return region
     cv2.setRNGSeed(_SEED)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(np.ascontiguousarray(image[part]), inside, None, *models, 1, cv2.GC_INIT_WITH_MASK)
     found = np.zeros(size, np.float32)
-    found[part] = (inside == cv2.GC_FGD) | (inside == cv2.GC_PR_FGD)
+    found[part] = _moves(inside)
     full = cv2.resize(found, (region.shape[1], region.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.asarray(full > 0.5)
 
 
-def _disk(radius: int) -> np.ndarray:
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)))
-
-
-def _around(uv: FloatArray, size: tuple[int, int], scale: FloatArray, radius: int) -> BoolArray:
-    """Return which working pixels (h, w) are within a radius of image pixels (N, 2)."""
-    column, row = np.floor((uv + 0.5) * scale).astype(np.int64).T
-    points = np.zeros(size, np.uint8)
-    points[np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)] = 1
-    return np.asarray(cv2.dilate(points, _disk(radius)) > 0)
+def _moves(label: np.ndarray) -> BoolArray:
+    return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
 
 
 def _around_region(near: np.ndarray, margin: int) -> tuple[slice, slice]:
