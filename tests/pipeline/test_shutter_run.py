@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.cue_noise import CueNoise
-from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.synthetic import SyntheticSceneConfig, make_synthetic_sequence
 from uni4d_fg.geometry.camera import intrinsics_matrix
@@ -79,9 +78,9 @@ def scene() -> Sequence:
     return rows_one_by_one(make_synthetic_sequence(settings))
 
 
-def cameras(run: Path, *changes: str, resume: bool = False) -> FloatArray:
+def cameras(run: Path, *changes: str, resume: bool = False, sequence: Sequence | None = None) -> FloatArray:
     plain = ("camera.model=pinhole", "camera.zoom=off", "camera_init.max_depth_spread=null")
-    reconstruct(scene(), run, make_config(*plain, *changes), resume=resume)
+    reconstruct(sequence or scene(), run, make_config(*plain, *changes), resume=resume)
     return load_reconstruction(RunFolder(run).reconstruction).world_T_cam
 
 
@@ -109,15 +108,37 @@ def test_cameras_of_a_rolling_shutter(tmp_path: Path) -> None:
 
 
 def test_a_run_goes_on_with_what_it_found(tmp_path: Path) -> None:
-    first = cameras(tmp_path / "run", "camera.rolling_shutter=auto")
-    np.testing.assert_array_equal(cameras(tmp_path / "run", "camera.rolling_shutter=auto", resume=True), first)
+    first = cameras(tmp_path / "run")
+    np.testing.assert_array_equal(cameras(tmp_path / "run", resume=True), first)
     summary = json.loads(RunFolder(tmp_path / "run").summary.read_text(encoding="utf-8"))
     assert summary["stages"]["rolling_shutter"]["resumed"]
-    assert np.abs(cameras(tmp_path / "run", resume=True) - first).max() > 1e-5
+    assert np.abs(cameras(tmp_path / "run", "camera.rolling_shutter=off", resume=True) - first).max() > 1e-5
     assert not (tmp_path / "run" / "stages" / "rolling_shutter.npz").exists()
 
 
-def test_what_estimates_no_camera_finds_no_readout(tmp_path: Path) -> None:
-    config = make_config("camera.rolling_shutter=auto", "input.intrinsics=fixed")
-    with pytest.raises(ConfigError, match=r"rolling_shutter=auto: with input\.intrinsics=fixed no readout"):
-        reconstruct(scene(), tmp_path / "run", config)
+def step(run: Path) -> dict[str, object] | None:
+    stages: dict[str, dict[str, object]] = json.loads(RunFolder(run).summary.read_text(encoding="utf-8"))["stages"]
+    return stages.get("rolling_shutter")
+
+
+def test_a_readout_is_found_beside_intrinsics_that_are_held(tmp_path: Path) -> None:
+    truth = scene().ground_truth
+    assert truth.intrinsics is not None
+    exact = dataclasses.replace(scene(), intrinsics=truth.intrinsics)
+    ate = {}
+    for setting in ("off", "auto"):
+        changes = (f"camera.rolling_shutter={setting}", "input.intrinsics=fixed")
+        poses = cameras(tmp_path / setting, *changes, sequence=exact)
+        ate[setting] = evaluate_trajectory(poses, truth.world_T_cam).ate_m
+    assert step(tmp_path / "off") is None
+    found = step(tmp_path / "auto")
+    assert found is not None
+    assert found["readout_s"] == pytest.approx(READOUT.seconds, abs=0.003)
+    assert ate["auto"] < 0.3 * ate["off"]
+
+
+def test_where_poses_are_held_no_readout_is_sought(tmp_path: Path) -> None:
+    truth = scene().ground_truth
+    given = dataclasses.replace(scene(), initial_world_T_cam=truth.world_T_cam)
+    cameras(tmp_path / "run", "input.poses=fixed", sequence=given)
+    assert step(tmp_path / "run") is None

@@ -40,10 +40,10 @@ class CameraConfig(Section):
         le=1,
     )
     rolling_shutter: float | Literal["off", "auto"] = setting(
-        "off",
+        "auto",
         "Rows that are read one after the other: the time from the first to the last, s (negative: the last one is "
-        "read first); 'auto' finds it where the tracks ask for it; 'off': all at once. Cameras are then those of the "
-        "middle rows.",
+        "read first); 'auto' finds it where the tracks ask for it; 'off': all at once. Cameras are those of the middle "
+        "rows.",
     )
     readout_axis: Literal["rows", "columns"] = setting(
         "rows", "What is read one after the other, where that time is given: columns in a video turned on its side."
@@ -97,9 +97,15 @@ class CameraConfig(Section):
     )
 
     @property
-    def has_rolling_shutter(self) -> bool:
-        """Whether rows may be read one after the other."""
-        return self.rolling_shutter not in ("off", 0.0)
+    def reads_at_once(self) -> bool:
+        """Whether all rows are known to be read at the same time."""
+        return self.rolling_shutter in ("off", 0.0)
+
+    @property
+    def given_readout(self) -> float | None:
+        """The time from the first row to the last, s, where it is given and not zero."""
+        given = self.rolling_shutter
+        return given if isinstance(given, float) and given else None
 
     @field_validator("starts")
     @classmethod

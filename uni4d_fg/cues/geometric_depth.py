@@ -281,8 +281,7 @@ def _reading(structure: Structure) -> list[str]:
         return []
     return [
         f"reading {structure.readout.axis} takes {abs(structure.readout.seconds):.2f} of the time between two frames: "
-        "focal length and lens are those of tracks at the time of the middle one (camera.rolling_shutter=auto solves "
-        "the cameras on them, too)"
+        "focal length and lens are those of tracks at the time of the middle one"
     ]
 
 

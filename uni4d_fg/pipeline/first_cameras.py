@@ -170,7 +170,10 @@ def _structure_step(
 
     spread = float(cameras["depth_spread"])
     said = f"depths of static points depart by {100 * spread:.0f} % from frame to frame"
-    sequence, labelled, config = seen.sequence, seen.labelled, seen.config
+    sequence, labelled = seen.sequence, seen.labelled
+    # A rolling shutter has been asked for, and what was found is undone.
+    at_once = seen.config.camera.model_copy(update={"rolling_shutter": "off"})
+    config = seen.config.model_copy(update={"camera": at_once})
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(2)
     if len(np.unique(static.track)) < config.geometric_depth.min_pose_points:
         return _kept(cameras, said, "tracks are few")

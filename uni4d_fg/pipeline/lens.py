@@ -22,6 +22,7 @@ from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.pipeline.warnings import focal_warnings
 from uni4d_fg.slam.lens.calibration import LensCalibration
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.rolling_shutter import Readout, readout_to_array
 from uni4d_fg.slam.lens.shutter_calibration import calibrate_with_shutter
 
 
@@ -66,10 +67,20 @@ def is_sought(sequence: Video | Sequence, config: Config) -> bool:
     return _rules_it_out(config) is None
 
 
+def is_readout_sought(config: Config) -> bool:
+    """Return whether the time in which rows are read is estimated; intrinsics may be given."""
+    return config.camera.rolling_shutter == "auto" and _rules_out_fits(config) is None
+
+
 def _rules_it_out(config: Config) -> tuple[str, str] | None:
     """Return the setting with which no lens can be estimated, and the one that it needs; None if nothing does."""
+    has = config.input.intrinsics
+    return ("input.intrinsics=fixed", "input.intrinsics=free") if has == "fixed" else _rules_out_fits(config)
+
+
+def _rules_out_fits(config: Config) -> tuple[str, str] | None:
+    """Return the setting with which neither lens nor readout can be estimated, and the one that they need."""
     needs = {
-        "input.intrinsics": (config.input.intrinsics, "free"),
         "input.poses": (config.input.poses, "estimate"),
         "energy": (config.energy, "map"),
         "solver": (config.solver, "lm"),
@@ -98,10 +109,6 @@ def check_camera(sequence: Video | Sequence, config: Config) -> None:
         check_parameters(sequence, config, f"with {has}", f"set {wanted}")
         if config.camera.zoom == "on":
             raise ConfigError(f"camera.zoom=on: with {has} no zoom is estimated; set {wanted}, or camera.zoom=auto")
-        if config.camera.rolling_shutter == "auto":
-            raise ConfigError(
-                f"camera.rolling_shutter=auto: with {has} no readout is estimated; set {wanted}, or give it in seconds"
-            )
 
 
 def check_parameters(sequence: Video | Sequence, config: Config, where: str, remedy: str) -> None:
@@ -119,9 +126,10 @@ def check_parameters(sequence: Video | Sequence, config: Config, where: str, rem
 
 
 def lens_step(
-    sequence: Sequence, labelled: LabelledTracks, config: Config, hooks: Hooks, run: StageRunner
-) -> StageRecord:
-    """Find the lens; where 'auto' cannot, the pinhole is kept and the summary says why.
+    sequence: Sequence, labelled: LabelledTracks, readout: Readout | None, config: Config, hooks: Hooks,
+    run: StageRunner,
+) -> StageRecord:  # fmt: skip
+    """Find the lens, and the readout with it; where 'auto' cannot, the pinhole is kept and the summary says why.
 
     Raises:
         DegenerateProblemError: If a model was asked for and the cues do not determine the cameras.
@@ -130,12 +138,14 @@ def lens_step(
     """
     try:
         found = calibrate_with_shutter(
-            labelled, sequence.timestamps, sequence.image_size, sequence.intrinsics, config, sequence.lens, hooks, run
-        )
+            labelled, sequence.timestamps, sequence.image_size, sequence.intrinsics, config, readout, sequence.lens,
+            hooks, run,
+        )  # fmt: skip
     except (DegenerateProblemError, SolverError) as error:
         if config.camera.model != "auto" or config.camera.zoom == "on":
             raise
-        found = LensCalibration(PINHOLE, sequence.intrinsics, note=f"no distortion was sought: {error}")
+        note = f"no distortion was sought: {error}"
+        found = LensCalibration(PINHOLE, sequence.intrinsics, note=note, readout=readout)
     except Cancelled as error:
         raise Cancelled(STOPPED) from error
     zoom, camera = found.zoom, found.camera
@@ -166,7 +176,10 @@ def lens_step(
             "focal_px": None if zoom.zoom is None else (zoom.intrinsics[0] * zoom.zoom).tolist(),
         }
     sigma = np.nan if camera.focal_sigma is None else camera.focal_sigma
-    arrays = {"camera": camera.to_array(), "intrinsics": camera.intrinsics, "focal_sigma": np.array(sigma)}
+    arrays = {
+        "camera": camera.to_array(), "intrinsics": camera.intrinsics, "focal_sigma": np.array(sigma),
+        "readout": readout_to_array(found.readout),
+    }  # fmt: skip
     return StageRecord(arrays, summary)
 
 

@@ -57,7 +57,7 @@ from uni4d_fg.pipeline.lens import found_camera, goes_along, is_sought, known_ca
 from uni4d_fg.pipeline.loops import loop_closing, with_loops
 from uni4d_fg.pipeline.measurements import MeasurementFiles, Measurements, read_measurements
 from uni4d_fg.pipeline.repeats import Repeats
-from uni4d_fg.pipeline.shutter import tracks_of_middle_rows
+from uni4d_fg.pipeline.shutter import readout_step
 from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, nonrigid_step
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary
@@ -76,6 +76,7 @@ from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.association.fragments import FragmentSearch
 from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.rolling_shutter import Readout, at_one_time, readout_of_array
 from uni4d_fg.slam.loops.closing import LoopClosing
 from uni4d_fg.slam.reconstruction import zoomed
 from uni4d_fg.slam.windows.plan import Window, windows_of
@@ -209,8 +210,9 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
         summary.stages["tracks"]["facts"] = [*summary.stages["tracks"].get("facts", []), repeats.fact()]
         key = stage_key(key, repeats.solved.tolist())
     judging = settings_of_judgment(config, sequence, depth_is_needed=not alone)
-    key, still_tracks = tracks_of_middle_rows(run, key, solved, solved_tracks, judging)
-    key, camera = _camera(run, key, solved, still_tracks, judging)
+    key, readout = readout_step(run, key, solved, solved_tracks, judging)
+    key, camera, readout = _camera(run, key, solved, solved_tracks, judging, readout)
+    still_tracks = at_one_time(solved_tracks, readout, solved.timestamps, solved.image_size)
     key, poses = stage_key(key, sequence.focal_sigma), None
     if windows:
         inputs = StageInputs.of(solved, still_tracks, camera, config, depth_is_needed=True)
@@ -260,17 +262,17 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
 
 
 def _camera(
-    run: RunInProgress, key: str, sequence: Sequence, labelled: LabelledTracks, config: Config
-) -> tuple[str, CameraModel]:
-    """Find the lens, where it is not given or ruled out; return the key so far and the camera."""
+    run: RunInProgress, key: str, sequence: Sequence, labelled: LabelledTracks, config: Config, readout: Readout | None
+) -> tuple[str, CameraModel, Readout | None]:
+    """Find the lens, where it is not given or ruled out; return the key so far, the camera and its readout."""
     if not is_sought(sequence, config):
-        return key, known_camera(sequence, config)
+        return key, known_camera(sequence, config), readout
     limit = config.camera_init.max_depth_spread
     stages = stage_key(key, config.camera, config.bundle_adjustment, config.windows.calibration_sightings, limit)
     # Without what users add to stages: the lens is found on some of the frames.
-    found = run.step("lens", stages, lambda hooks: lens_step(sequence, labelled, config, hooks, run.recorder))
-    camera = found_camera(found)
-    return key if camera.is_plain else stages, camera
+    found = run.step("lens", stages, lambda hooks: lens_step(sequence, labelled, readout, config, hooks, run.recorder))
+    camera, of_lens = found_camera(found), readout_of_array(found["readout"])
+    return key if camera.is_plain and of_lens == readout else stages, camera, of_lens
 
 
 def _stages(

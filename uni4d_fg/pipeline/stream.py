@@ -117,7 +117,7 @@ def not_in_streams(config: Config) -> list[str]:
     """Return a warning of what a configuration asks for and a stream leaves out; empty where there is nothing."""
     asked = {
         "input.poses": config.input.poses != "estimate",
-        "camera.rolling_shutter": config.camera.has_rolling_shutter,
+        "camera.rolling_shutter": config.camera.given_readout is not None,
         "joint.enabled": config.joint.enabled,
         "rigid_objects.enabled": config.rigid_objects.enabled,
         "windows.frames": config.windows.frames is not None,

@@ -14,7 +14,7 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.readout_fit import ReadoutFit
-from uni4d_fg.slam.lens.rolling_shutter import Readout, at_one_time
+from uni4d_fg.slam.lens.rolling_shutter import Readout, at_one_time, readout_of_array, readout_to_array
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 
 
@@ -68,7 +68,7 @@ def test_intervals_that_differ_are_told_apart() -> None:
     assert shift_px(moved.uv[beside], scene.still[:, kept][beside], inner) < 0.1 * before
 
 
-@pytest.mark.parametrize("true", [Readout(0.015), Readout(-0.02), Readout(0.025, "columns")])
+@pytest.mark.parametrize("true", [Readout(0.015), Readout(-0.02), Readout(0.025, "columns"), Readout(0.03)])
 def test_the_readout_is_found(true: Readout) -> None:
     scene = shutter_scene(true, noise_px=0.2)
     found = ReadoutFit(scene.labelled, TIMES, SIZE, CameraModel(K), load_config("default", [])).find()
@@ -76,6 +76,20 @@ def test_the_readout_is_found(true: Readout) -> None:
     assert found.readout.axis == true.axis
     assert found.readout.seconds == pytest.approx(true.seconds, abs=0.04 / RATE)
     assert found.evidence > 0.3
+
+
+def test_a_readout_that_no_shutter_has_is_not_believed() -> None:
+    scene = shutter_scene(Readout(1.15 / RATE), noise_px=0.2)
+    found = ReadoutFit(scene.labelled, TIMES, SIZE, CameraModel(K), load_config("default", [])).find()
+    assert found.is_asked_for
+    assert found.best is not None
+    assert found.best.seconds == pytest.approx(1.0 / RATE)
+    assert found.readout is None
+
+
+def test_a_readout_is_the_same_after_it_was_stored() -> None:
+    for readout in (None, Readout(-0.02), Readout(0.01, "columns")):
+        assert readout_of_array(readout_to_array(readout)) == readout
 
 
 def test_a_global_shutter_asks_for_none() -> None:

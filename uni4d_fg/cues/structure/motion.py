@@ -148,7 +148,8 @@ def structure_from_motion(
     if any_camera and free_focal:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
-        grown, observations, readout = quiet.at_one_time(grown, observations, camera.intrinsics)
+        if not config.camera.reads_at_once:
+            grown, observations, readout = quiet.at_one_time(grown, observations, camera.intrinsics)
         try:
             found = find_camera(
                 grown.scene, observations, image_size, config,

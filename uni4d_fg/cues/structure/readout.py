@@ -16,7 +16,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.cues.structure.camera_search import part_of, seen_by
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.slam.lens.readout_search import FIRST, LONGEST, least_readout
+from uni4d_fg.slam.lens.readout_search import BELIEVED, FIRST, least_readout
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -54,7 +54,7 @@ def find_readout(scene: GrowingScene, observations: Observations, image_size: tu
     if not likely:
         return None
     best = min((trials.best_along(axis) for axis in likely), key=trials.loss)
-    is_told = trials.loss(best) <= 1.0 - least and abs(best.seconds) < LONGEST
+    is_told = trials.loss(best) <= 1.0 - least and abs(best.seconds) < BELIEVED
     return best if is_told else None
 
 

@@ -31,6 +31,7 @@ from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import FittedLens, LensFit
 from uni4d_fg.slam.lens.lens_search import LensCandidate, LensSearch, candidate_of
+from uni4d_fg.slam.lens.rolling_shutter import Readout
 from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample, is_static
 from uni4d_fg.slam.lens.sharpness import sharp_frames
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
@@ -57,6 +58,8 @@ class LensCalibration:
     """What was found of a zoom; None where none was sought."""
     focal_sigma: float | None = None
     """Standard deviation of the log of focal lengths that the stages are to hold; None lets them move on."""
+    readout: Readout | None = None
+    """That the stages are to undo, too (:mod:`uni4d_fg.slam.lens.shutter_calibration`)."""
 
     @property
     def camera(self) -> CameraModel:

@@ -22,7 +22,7 @@ from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import LensFit
-from uni4d_fg.slam.lens.readout_search import least_readout
+from uni4d_fg.slam.lens.readout_search import BELIEVED, LONGEST, least_readout
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout, at_one_time
 from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample
 from uni4d_fg.slam.stages.acceleration import frame_interval
@@ -34,13 +34,21 @@ from uni4d_fg.slam.stages.scene import StaticScene
 class FoundReadout:
     """What was found."""
 
-    readout: Readout | None
-    """None where the tracks do not ask for one."""
     best: Readout | None = None
-    """The one that explains them best, asked for or not; None where none was sought."""
+    """The one that explains the tracks best; None for none, or where none was sought."""
     evidence: float = 0.0
     """Part of the reprojection energy that goes away with it."""
+    is_asked_for: bool = False
+    """Whether that is enough."""
+    is_longest: bool = False
+    """Whether it takes all of the time between two frames, or next to it. No shutter is as long: something else makes
+    tracks ask for it, in part."""
     solves: list[SolveSummary] = field(default_factory=list)
+
+    @property
+    def readout(self) -> Readout | None:
+        """The one to solve cameras with; None where the tracks do not ask for one, or for one that cannot be."""
+        return self.best if self.is_asked_for and not self.is_longest else None
 
 
 class ReadoutFit:
@@ -84,13 +92,16 @@ class ReadoutFit:
     def find(self) -> FoundReadout:
         """Return the readout that explains the tracks best, and whether they ask for it."""
         if self.scene.noise.measured_px < EXACT_PX or len(self.timestamps) < 3:
-            return FoundReadout(None, solves=self.fit.solves)
+            return FoundReadout(solves=self.fit.solves)
         interval = frame_interval(self.timestamps)
         best = min((self._along(axis, interval) for axis in ("rows", "columns")), key=self.energy)
         reprojection = self._solved[None].final_energies["static_reprojection"]
         evidence = (self.energy(None) - self.energy(best)) / max(reprojection, 1e-300)
-        asked = evidence >= self.fit.config.camera.min_readout_evidence
-        return FoundReadout(best if asked else None, best, evidence, self.fit.solves)
+        asked = best is not None and evidence >= self.fit.config.camera.min_readout_evidence
+        longest = best is not None and abs(best.seconds) >= BELIEVED * interval
+        if best is not None and longest:
+            best = Readout(float(np.copysign(LONGEST * interval, best.seconds)), best.axis)
+        return FoundReadout(best, evidence, asked, longest, self.fit.solves)
 
     def energy(self, readout: Readout | None) -> float:
         """Return the energy that bundle adjustment ends at with a readout, from where the last one ended."""
@@ -119,7 +130,5 @@ class ReadoutFit:
 
     def _at(self, readout: Readout | None) -> LabelledTracks:
         """Return the chosen tracks in the chosen frames, with a readout undone, and a lens and a zoom if known."""
-        labelled = self.tracks
-        if readout is not None:
-            labelled = at_one_time(labelled, readout, self.timestamps, self.image_size)
+        labelled = at_one_time(self.tracks, readout, self.timestamps, self.image_size)
         return self.sample.cut(self.camera.ideal_labelled(labelled))

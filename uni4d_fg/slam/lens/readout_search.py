@@ -12,6 +12,8 @@ _OUTWARD = 2.2
 """Factor to the next where one is the best."""
 LONGEST = 1.0
 """No image is read longer than until the next."""
+BELIEVED = 0.95
+"""Nor is one read for as long as this: sensors pause between two images."""
 _PARABOLAS, _NEAR = 3, 0.02
 """Readouts that are nearer than this to one that was tried are not."""
 
@@ -29,6 +31,9 @@ def least_readout(energy: Callable[[float], float]) -> float:
             break
         farther = float(np.clip(_OUTWARD * best, -LONGEST, LONGEST))
         tried[farther] = energy(farther)
+    if abs(best) >= LONGEST:  # the least may well lie before it, and a parabola through none beyond is a poor one
+        inner = 0.5 * (best + min((part for part in tried if part != best), key=lambda part: abs(part - best)))
+        tried[inner] = energy(inner)
     for _ in range(_PARABOLAS):
         # Of the best and those beside it: farther ones are no parabola's.
         at = sorted(tried)

@@ -42,8 +42,18 @@ class Readout:
         return result
 
 
+def readout_to_array(readout: Readout | None) -> FloatArray:
+    """Return a readout as an array (2,): seconds, NaN for none, and 1 for columns."""
+    return np.array([np.nan, 0.0] if readout is None else [readout.seconds, float(readout.axis == "columns")])
+
+
+def readout_of_array(array: FloatArray) -> Readout | None:
+    """Return what :func:`readout_to_array` took."""
+    return None if np.isnan(array[0]) else Readout(float(array[0]), "columns" if array[1] else "rows")
+
+
 def at_one_time(
-    labelled: LabelledTracks, readout: Readout, timestamps: FloatArray, image_size: tuple[int, int]
+    labelled: LabelledTracks, readout: Readout | None, timestamps: FloatArray, image_size: tuple[int, int]
 ) -> LabelledTracks:
     """Return tracks at the places where they are when the middle of each image is read.
 
@@ -52,10 +62,12 @@ def at_one_time(
 
     Args:
         labelled: K tracks over T frames, on real pixels.
-        readout: Of the camera.
+        readout: Of the camera; with None, they stay.
         timestamps: (T,) s, increasing.
         image_size: (height, width), px.
     """
+    if readout is None:
+        return labelled
     tracks = labelled.tracks
     uv = tracks.uv.astype(np.float64)
     moved = readout.undone(uv, *_motion(uv, tracks.visible, timestamps), image_size)
