@@ -97,7 +97,7 @@ def test_the_extension_solves_every_stage(small_scene: Sequence, tmp_path: Path)
     assert used == {
         "camera_init": {"C++ frame pairs": {"depth_reprojection"}},
         "lens": {
-            "C++ landmark elimination": {"depth_prior"},
+            "C++ landmark elimination": {"static_reprojection", "depth_prior"},
             "linearized blocks in the C++ landmark elimination": {"static_reprojection"},
             "NumPy, on what is not eliminated": cameras | {"zoom_smoothness"},
         },

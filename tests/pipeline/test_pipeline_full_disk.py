@@ -90,7 +90,7 @@ def test_every_writer_fails_cleanly_and_the_run_goes_on_where_it_was(
     check_run(tmp_path, sequence)
     assert_same_result(tmp_path, complete)
     stages = [
-        "tracks.npz", "lens.graph.npz", "lens.npz", "camera_init.graph.npz", "camera_init.npz",
+        "tracks.npz", "rolling_shutter.npz", "lens.graph.npz", "lens.npz", "camera_init.graph.npz", "camera_init.npz",
         "bundle_adjustment.graph.npz",
         "bundle_adjustment.npz", "nonrigid.graph.npz", "nonrigid.npz",
     ]  # fmt: skip

@@ -15,7 +15,16 @@ from uni4d_fg.pipeline import reconstruct
 
 pytest.importorskip("open3d")
 
-TASKS = ["tracks", "lens", "camera init", "bundle adjustment", "nonrigid", "fusion", "clouds and pictures"]
+TASKS = [
+    "tracks",
+    "rolling shutter",
+    "lens",
+    "camera init",
+    "bundle adjustment",
+    "nonrigid",
+    "fusion",
+    "clouds and pictures",
+]
 
 
 class Recorder:

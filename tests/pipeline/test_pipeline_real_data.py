@@ -66,6 +66,7 @@ def test_the_run_is_complete(run: tuple[RunSummary, Reconstruction, EvaluationRe
     summary, result, _ = run
     assert list(summary.stages) == [
         "tracks",
+        "rolling_shutter",
         "lens",
         "camera_init",
         "bundle_adjustment",

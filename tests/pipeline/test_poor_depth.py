@@ -141,7 +141,7 @@ def test_a_run_that_was_stopped_there_goes_on(tmp_path: Path) -> None:
         reconstruct(sequence, tmp_path / "run", config, reporter=reporter, should_stop=lambda: reporter.reached)
     summary = reconstruct(sequence, tmp_path / "run", config, resume=True)
     resumed = {name for name, was in resumed_stages(summary).items() if was}
-    assert resumed == {"tracks", "lens", "camera_init", STEP}
+    assert resumed == {"tracks", "rolling_shutter", "lens", "camera_init", STEP}
     assert_same_result(tmp_path / "run", tmp_path / "undisturbed")
     assert summary.stages[STEP]["facts"] == undisturbed.stages[STEP]["facts"]
     again = reconstruct(sequence, tmp_path / "run", make_config("fusion.multiview.enabled=false", ALWAYS), resume=True)

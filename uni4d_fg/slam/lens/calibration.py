@@ -22,7 +22,6 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.geometry.lens import PARAMETERS, PINHOLE, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
@@ -32,7 +31,7 @@ from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.fit import FittedLens, LensFit
 from uni4d_fg.slam.lens.lens_search import LensCandidate, LensSearch, candidate_of
 from uni4d_fg.slam.lens.rolling_shutter import Readout
-from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample, is_static
+from uni4d_fg.slam.lens.sample import EXACT_PX, CalibrationSample
 from uni4d_fg.slam.lens.sharpness import sharp_frames
 from uni4d_fg.slam.lens.zoom import ZoomCalibration, find_zoom, solve_zoom
 from uni4d_fg.slam.lens.zoom_fit import ZoomFit
@@ -108,8 +107,6 @@ def calibrate_lens(
     """
     settings = config.camera
     count = labelled.tracks.num_frames
-    if not (labelled.weight[is_static(labelled)] > 0).any():
-        raise DegenerateProblemError("the lens: there is no static track")
     sample = CalibrationSample.of(labelled, config, sharp_frames(labelled.tracks.blur_px, count))
     some = sample.cut(sample.tracks(settings.observations))
     held_out = np.arange(len(some.label)) % settings.hold_out_every == 0

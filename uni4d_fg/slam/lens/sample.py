@@ -8,6 +8,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, IntArray, evenly_spread
 from uni4d_fg.config.models import Config
+from uni4d_fg.errors import DegenerateProblemError
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.slam.stages.bundle_adjustment import without_camera_motion
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames, tracks_in
@@ -27,7 +28,13 @@ class CalibrationSample:
 
     @classmethod
     def of(cls, labelled: LabelledTracks, config: Config, usable: BoolArray | None = None) -> CalibrationSample:
-        """Choose evenly spaced frames that tracks still tie together, and of these the usable (T,)."""
+        """Choose evenly spaced frames that tracks still tie together, and of these the usable (T,).
+
+        Raises:
+            DegenerateProblemError: If there is no static track.
+        """
+        if not (labelled.weight[is_static(labelled)] > 0).any():
+            raise DegenerateProblemError("the lens: there is no static track")
         count = labelled.tracks.num_frames
         sightings = config.windows.calibration_sightings
         frames = calibration_frames(TrackSpans.of(labelled), count, config.camera.frames, sightings)
