@@ -17,7 +17,7 @@ What stands still through the whole video is static here, whatever it is.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -44,7 +44,7 @@ from uni4d_fg.cues.track_motion import QuadraticGrid, TrackMotion, find_moving_t
 from uni4d_fg.errors import Cancelled, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
-from uni4d_fg.optim.threads import OrderedMap, thread_count, workers_in_order
+from uni4d_fg.optim.threads import OrderedMap, made_ahead, thread_count, workers_in_order
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
@@ -118,7 +118,7 @@ def motion_masks(
     comparison = _Comparison(video, depths, tracks, cameras, camera, motion, config)
     labels = CompressedLabels(video.image_size)
     seen_in: dict[int, int] = {}
-    found = comparison.detections(stop)
+    found = made_ahead(comparison.detections(stop), thread_count())
     for frame, numbers in enumerate(associate_instances(found, video.images, config.instances, stop)):
         labels.append(numbers)
         for number in np.unique(numbers[numbers > 0]).tolist():
@@ -233,7 +233,7 @@ class _Comparison:
         self.frames: dict[int, FrameAppearance] = {}
         self.flow = DenseFlow(fine=False)
 
-    def detections(self, stop: Callable[[], bool]) -> Iterator[FrameDetections]:
+    def detections(self, stop: Callable[[], bool]) -> Generator[FrameDetections, None, None]:
         """Yield the regions that move, frame by frame."""
         count = self.video.num_frames
         window: deque[Float32Array] = deque()  # evidence of the frame before, of this one, and of the next

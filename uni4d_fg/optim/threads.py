@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from functools import cache, wraps
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 from threadpoolctl import ThreadpoolController
 
@@ -108,3 +109,19 @@ def workers_in_order(threads: int) -> Iterator[OrderedMap]:
             return
         with ThreadPoolExecutor(threads) as pool:
             yield pool.map
+
+
+def made_ahead(items: Generator[ItemT, None, None], threads: int, ahead: int = 2) -> Iterator[ItemT]:
+    """Pass on what a generator yields, made on a thread of its own up to ``ahead`` items before it is asked for.
+
+    With one thread each is made when it is asked for. The generator is closed when the caller is done with it.
+    """
+    if threads == 1:
+        yield from items
+        return
+    end = object()
+    with closing(items), ThreadPoolExecutor(1) as maker:
+        coming = deque(maker.submit(next, items, end) for _ in range(ahead))
+        while (item := coming.popleft().result()) is not end:
+            coming.append(maker.submit(next, items, end))
+            yield cast(ItemT, item)
