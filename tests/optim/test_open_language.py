@@ -51,7 +51,7 @@ def camera_position(world_T_cam: Array, *, xyz: Array) -> Array:
 
 
 @factor(MAP_POSE, POSE, LEVER_ARM, data={"xyz": 3}, dim=3)
-def antenna(map_T_world: Array, world_T_cam: Array, lever_arm: Array, *, xyz: Array) -> Array:
+def mapped_antenna(map_T_world: Array, world_T_cam: Array, lever_arm: Array, *, xyz: Array) -> Array:
     """Where an antenna on the camera is on a map: R_m (R_c a + t_c) + t_m - xyz."""
     point = (world_T_cam[..., :3, :3] @ lever_arm[..., None])[..., 0] + world_T_cam[..., :3, 3]
     return (map_T_world[..., :3, :3] @ point[..., None])[..., 0] + map_T_world[..., :3, 3] - xyz
@@ -122,7 +122,7 @@ def with_foreign_factors(problem: Problem, state: State, kinds: Sequence[str]) -
             **problem.free, LEVER_ARM: np.ones((1, 3), dtype=bool), MAP_POSE: np.ones((1, 6), dtype=bool),
         }  # fmt: skip
         xyz = centers + np.array([1.0, 2.0, 0.5]) + rng.normal(scale=0.02, size=(FRAMES, 3))
-        problem.add(antenna(0, frames, 0, xyz=xyz, sigma=0.05))
+        problem.add(mapped_antenna(0, frames, 0, xyz=xyz, sigma=0.05))
         problem.add(gtsam.PriorFactorPoint3(LEVER_ARM.key(0), np.zeros(3), sigmas(0.1, 3)), state=state)
         problem.add(gtsam.PriorFactorPose3(MAP_POSE.key(0), gtsam.Pose3(), sigmas(3.0, 6)), state=state)
     if "prior" in kinds:

@@ -25,6 +25,7 @@ from uni4d_fg.optim.added_factors import adding_to
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.pipeline.dropped_tracks import dropped_tracks
 from uni4d_fg.pipeline.inertial import imu_fact, imu_summary
 from uni4d_fg.pipeline.rigid import rigid_objects_part
 from uni4d_fg.pipeline.store import StageRecord
@@ -220,6 +221,7 @@ def bundle_summary(
         arrays["landmark_error"],
         noise.reprojection_sigma_px,
         max(sequence.image_size),
+        lambda: dropped_tracks(labelled, arrays),
     )
     return {"solves": solves, "dropped": dropped, "facts": facts, "warnings": warnings}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
@@ -33,6 +35,7 @@ def unmasked_motion_warnings(
     landmark_error: Float32Array,
     noise_px: float,
     longer_side_px: int,
+    dropped: Callable[[], tuple[IntArray, FloatArray]],
 ) -> list[str]:
     """Return a sentence if something seems to move and no track was labelled as moving.
 
@@ -42,20 +45,24 @@ def unmasked_motion_warnings(
         labelled: All tracks.
         landmark_track: (N,) tracks of the static scene's landmarks.
         landmark_error: (N,) their median reprojection errors, px.
+        dropped: Returns static tracks (D,) that are no landmarks, and their errors (D,), px, NaN where not known.
         noise_px: Standard deviation of the static scene's reprojection.
         longer_side_px: Of the images.
     """
     if len(landmark_track) < 2 or (labelled.label == TrackLabel.DYNAMIC).any():
         return []
-    moves = landmark_error > max(_MOVES_SIGMAS * noise_px, _MOVES_PART * longer_side_px)
+    others, error = dropped()
+    track, error = np.concatenate([landmark_track, others]), np.concatenate([landmark_error, error])
+    with np.errstate(invalid="ignore"):
+        moves = error > max(_MOVES_SIGMAS * noise_px, _MOVES_PART * longer_side_px)
     share = float(moves.mean())
     if share < _MOVING_SHARE:
         return []
     from scipy.spatial import cKDTree
     from scipy.stats import binom
 
-    seen = labelled.weight[landmark_track, :, None] > 0
-    place = np.where(seen, labelled.tracks.uv[landmark_track], 0.0).sum(axis=1) / seen.sum(axis=1)
+    seen = labelled.weight[track, :, None] > 0
+    place = np.where(seen, labelled.tracks.uv[track], 0.0).sum(axis=1) / seen.sum(axis=1)
     _, nearest = cKDTree(place).query(place[moves], k=2)
     beside = int(moves[nearest[:, 1]].sum())
     if binom.sf(beside - 1, int(moves.sum()), share) > _BY_CHANCE:
