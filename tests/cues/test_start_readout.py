@@ -9,8 +9,9 @@ import pytest
 from cues.start_scenes import GUESS, SIZE, K, TrackedScene
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
-from uni4d_fg.cues.structure.readout import at_one_time
+from uni4d_fg.cues.structure.readout import at_one_time, is_told_still
 from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, world_to_camera
@@ -101,6 +102,23 @@ def test_a_search_that_cannot_be_solved_leaves_the_scene_as_it_is(monkeypatch: p
     assert structure.readout is None
     plain, _ = found(scene, any_camera=False)
     assert structure.sigma_px <= 1.1 * plain.sigma_px
+
+
+@pytest.mark.parametrize(("true", "is_told"), [(0.5, True), (0.0, False)])
+def test_a_readout_is_asked_for_again_with_tracks_that_were_moved(
+    true: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where it was not there, moving the tracks has made them worse."""
+    readout, grown = Readout(0.5), list[GrowingScene]()
+
+    def taken(scene: GrowingScene, *_: object) -> None:
+        grown.append(scene)
+
+    scene = read_by(Readout(true))
+    moved = at_one_time(scene.observations, readout, SIZE)
+    monkeypatch.setattr("uni4d_fg.cues.structure.motion.find_readout", taken)
+    found(replace(scene, observations=moved))
+    assert is_told_still(grown[0], moved, readout, SIZE) == is_told
 
 
 @pytest.mark.parametrize("least", [0.0, 0.13, -0.47, 0.85])

@@ -77,3 +77,8 @@ def without_depth_prior(config: Config) -> Config:
     """Return the configuration with which the depth cue says nothing of the cameras."""
     stage = bundle_adjustment.without_depth_prior(config.bundle_adjustment)
     return config.model_copy(update={"bundle_adjustment": stage})
+
+
+def without_rolling_shutter(config: Config) -> Config:
+    """Return the configuration with which all rows are taken to be read at once, as those of tracks that were moved."""
+    return config.model_copy(update={"camera": config.camera.model_copy(update={"rolling_shutter": "off"})})

@@ -20,7 +20,12 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.depth_settings import settings_behind_lens, settings_of_motion, without_depth_prior
+from uni4d_fg.cues.depth_settings import (
+    settings_behind_lens,
+    settings_of_motion,
+    without_depth_prior,
+    without_rolling_shutter,
+)
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
@@ -171,9 +176,8 @@ def _structure_step(
     spread = float(cameras["depth_spread"])
     said = f"depths of static points depart by {100 * spread:.0f} % from frame to frame"
     sequence, labelled = seen.sequence, seen.labelled
-    # A rolling shutter has been asked for, and what was found is undone.
-    at_once = seen.config.camera.model_copy(update={"rolling_shutter": "off"})
-    config = seen.config.model_copy(update={"camera": at_once})
+    # One has been asked for, and what was found is undone.
+    config = without_rolling_shutter(seen.config)
     static = observations_of(labelled, TrackLabel.STATIC, TrackLabel.SHORT_STATIC).with_min_observations(2)
     if len(np.unique(static.track)) < config.geometric_depth.min_pose_points:
         return _kept(cameras, said, "tracks are few")

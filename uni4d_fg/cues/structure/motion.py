@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
+from uni4d_fg.cues.depth_settings import without_rolling_shutter
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
@@ -18,7 +19,7 @@ from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
-from uni4d_fg.cues.structure.readout import at_one_time, find_readout
+from uni4d_fg.cues.structure.readout import at_one_time, find_readout, is_told_still
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
@@ -137,6 +138,7 @@ def structure_from_motion(
     if should_stop():
         raise Cancelled("structure from motion stopped")
     search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop)
+    known, seen = camera, observations
     if camera is None or camera.is_plain:
         camera = CameraModel(intrinsics)
     observations = camera.ideal_observations(observations)
@@ -168,6 +170,11 @@ def structure_from_motion(
                 taken = not is_lens or search.tells_lens(again, found, is_open)
                 if is_open or (taken and search.is_weak(found.camera)):
                     beside = [(grown if taken else again).scene.mean_focal]
+                if taken and readout is not None and not is_told_still(again.scene, ideal, readout, image_size):
+                    return structure_from_motion(
+                        seen, num_frames, image_size, intrinsics, without_rolling_shutter(config), reporter,
+                        should_stop, with_doubts, known, any_camera, proposed, blur_px,
+                    )  # fmt: skip
                 if taken:
                     grown, camera, observations = again, found.camera, ideal
     scene, hypotheses, best = grown.scene, grown.hypotheses, grown.hypotheses[0]

@@ -43,12 +43,9 @@ def find_readout(scene: GrowingScene, observations: Observations, image_size: tu
         Cancelled: If asked to stop.
         SolverError: If bundle adjustment fails.
     """
-    part = part_of(scene, _OBSERVATIONS, np.ones(len(scene.registered), dtype=bool))
-    if not part.good.any():
+    trials = _trials_of(scene, observations, image_size)
+    if trials is None:
         return None
-    rows = _rows_of(part.observations, observations)
-    velocity, acceleration = (values[rows] for values in _motion(observations))
-    trials = _Trials(part, velocity, acceleration, image_size)
     least = scene.config.camera.min_readout_evidence
     likely = [axis for axis in _AXES if trials.gain_at_first(axis) >= 0.5 * least]
     if not likely:
@@ -56,6 +53,36 @@ def find_readout(scene: GrowingScene, observations: Observations, image_size: tu
     best = min((trials.best_along(axis) for axis in likely), key=trials.loss)
     is_told = trials.loss(best) <= 1.0 - least and abs(best.seconds) < BELIEVED
     return best if is_told else None
+
+
+def is_told_still(
+    scene: GrowingScene, observations: Observations, readout: Readout, image_size: tuple[int, int]
+) -> bool:
+    """Tell whether tracks ask for a readout with the camera, too, that was found after it: a zoom may look like one.
+
+    Args:
+        scene: Grown with that camera.
+        observations: N, from which it was grown: moved by the readout, on ideal pixels.
+        readout: In units of the time between two frames.
+        image_size: (height, width), px.
+
+    Raises:
+        Cancelled: If asked to stop.
+        SolverError: If bundle adjustment fails.
+    """
+    trials = _trials_of(scene, observations, image_size)
+    undone = replace(readout, seconds=-readout.seconds)
+    return trials is not None and trials.loss(undone) * (1.0 - scene.config.camera.min_readout_evidence) >= 1.0
+
+
+def _trials_of(scene: GrowingScene, observations: Observations, image_size: tuple[int, int]) -> _Trials | None:
+    """Return trials with part of a scene's tracks; None if none of them has a point."""
+    part = part_of(scene, _OBSERVATIONS, np.ones(len(scene.registered), dtype=bool))
+    if not part.good.any():
+        return None
+    rows = _rows_of(part.observations, observations)
+    velocity, acceleration = (values[rows] for values in _motion(observations))
+    return _Trials(part, velocity, acceleration, image_size)
 
 
 def at_one_time(observations: Observations, readout: Readout, image_size: tuple[int, int]) -> Observations:
