@@ -45,9 +45,9 @@ def unmasked_motion_warnings(
         labelled: All tracks.
         landmark_track: (N,) tracks of the static scene's landmarks.
         landmark_error: (N,) their median reprojection errors, px.
-        dropped: Returns static tracks (D,) that are no landmarks, and their errors (D,), px, NaN where not known.
         noise_px: Standard deviation of the static scene's reprojection.
         longer_side_px: Of the images.
+        dropped: Returns static tracks (D,) that are no landmarks, and their errors (D,), px, NaN where not known.
     """
     if len(landmark_track) < 2 or (labelled.label == TrackLabel.DYNAMIC).any():
         return []
