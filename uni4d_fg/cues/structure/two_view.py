@@ -78,23 +78,26 @@ def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray
         known_focal: Whether the focal lengths are exact.
     """
     if known_focal:
-        return _left_by_rotations(uv_first, uv_second, intrinsics, np.ones(1))[0]
-    left = _left_by_rotations(uv_first, uv_second, intrinsics, _FOCAL_FACTORS)
+        return left_by_rotations(uv_first, uv_second, intrinsics[None])[0]
+    left = left_by_rotations(uv_first, uv_second, _multiples(intrinsics, _FOCAL_FACTORS))
     least = min(left)
     if least.median > _DOUBTFUL_PX:
         return least
     # A camera that turns far leaves pixels at a focal length between two factors.
     finer = _FOCAL_FACTORS[left.index(least)] * _FINER_FACTORS
-    return min(least, *_left_by_rotations(uv_first, uv_second, intrinsics, finer))
+    return min(least, *left_by_rotations(uv_first, uv_second, _multiples(intrinsics, finer)))
 
 
-def _left_by_rotations(
-    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, factors: FloatArray
-) -> list[Parallax]:
-    """Return what a rotation leaves at each of F multiples of the focal lengths."""
+def _multiples(intrinsics: FloatArray, factors: FloatArray) -> FloatArray:
+    """Return intrinsics (F, 4) px with focal lengths multiplied by F factors."""
     scale = np.ones((len(factors), 4))
     scale[:, :2] = factors[:, None]
-    _, distance = _fit_rotations(uv_first, uv_second, intrinsics * scale)
+    return np.asarray(intrinsics * scale)
+
+
+def left_by_rotations(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray) -> list[Parallax]:
+    """Return what a rotation leaves of the motion of N pixel pairs (N, 2), px, with each of F intrinsics (F, 4)."""
+    _, distance = _fit_rotations(uv_first, uv_second, intrinsics)
     return [Parallax(*map(float, part)) for part in np.quantile(distance, [0.5, 0.75], axis=1).T]
 
 

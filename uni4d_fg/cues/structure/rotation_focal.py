@@ -1,0 +1,92 @@
+"""The focal length of a camera that stays in one place, from how it turns.
+
+A pure rotation moves every pixel by ``K R K^-1``, whatever its depth. With a focal length that is wrong, a rotation
+about x or y leaves something over, which grows with the square of the angle; even the tremor of a hand is enough. Each
+pair of frames votes for the focal length that leaves least, where that is clearly less than what others leave.
+
+Source: Hartley, "Self-calibration from multiple views with a rotating camera" (ECCV 1994), for one unknown.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from uni4d_fg.arrays import FloatArray, evenly_spread
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.structure.first_pair import CommonTracks
+from uni4d_fg.cues.structure.two_view import left_by_rotations
+from uni4d_fg.slam.stages.observations import Observations
+
+_FOCALS = np.geomspace(0.35, 5.0, 68)
+"""Focal lengths that are tried, as parts of the longer side of the image: steps of 4 %."""
+_SAMPLED_FRAMES = 12
+_CLEAR = 1.5
+"""At the shortest and the longest focal length, so many times what is left at the best must be left."""
+_MIN_VOTES = 8
+_AGREED = 1.35
+"""Pairs agree if the upper quartile of their votes is at most this many times the lower one."""
+_LEAST_SIGMA = 0.01
+
+
+class RotationFocal(NamedTuple):
+    """A focal length that rotations tell."""
+
+    focal: float
+    """px."""
+    sigma: float
+    """Standard deviation of its log."""
+
+
+def focal_of_rotations(
+    observations: Observations,
+    num_frames: int,
+    image_size: tuple[int, int],
+    intrinsics: FloatArray,
+    config: GeometricDepthConfig,
+) -> RotationFocal | None:
+    """Return the focal length with which rotations explain best what frames see; None where pairs do not agree on one.
+
+    Args:
+        observations: N, of static tracks, seen by a camera that only turns.
+        num_frames: T.
+        image_size: (height, width), px.
+        intrinsics: (4,) px, of which the principal point serves.
+        config: How many tracks of a pair of frames are needed and taken.
+    """
+    tried = np.column_stack(
+        [np.tile((_FOCALS * max(image_size))[:, None], 2), np.tile(intrinsics[2:], (len(_FOCALS), 1))]
+    )
+    frames = evenly_spread(num_frames, _SAMPLED_FRAMES).tolist()
+    common = CommonTracks(observations, num_frames)
+    left = []
+    for position, first in enumerate(frames):
+        for second in frames[position + 1 :]:
+            a, b = common.between(first, second)
+            if len(a) < config.min_common_tracks:
+                break  # tracks only get fewer
+            used = evenly_spread(len(a), config.fitted_tracks)
+            pair = left_by_rotations(observations.uv[a[used]], observations.uv[b[used]], tried)
+            left.append([parallax.median for parallax in pair])
+    if not left:
+        return None
+    log_left = np.log(np.maximum(left, 1e-6))
+    best = log_left.argmin(axis=1)
+    clear = np.minimum(log_left[:, 0], log_left[:, -1]) - log_left.min(axis=1) > np.log(_CLEAR)
+    votes = np.log(_FOCALS[best[clear]])
+    if len(votes) < _MIN_VOTES:
+        return None
+    lower, upper = np.quantile(votes, [0.25, 0.75])
+    if upper - lower > np.log(_AGREED):
+        return None
+    focal = float(np.exp(_least(np.log(_FOCALS), log_left[clear].mean(axis=0))) * max(image_size))
+    return RotationFocal(focal, max(0.5 * float(upper - lower), _LEAST_SIGMA))
+
+
+def _least(x: FloatArray, y: FloatArray) -> float:
+    """Return where the parabola through the least of evenly spaced values and those beside it is least."""
+    at = int(np.clip(np.argmin(y), 1, len(y) - 2))
+    bend = y[at - 1] - 2.0 * y[at] + y[at + 1]
+    shift = 0.5 * (y[at - 1] - y[at + 1]) / bend if bend > 0.0 else 0.0
+    return float(x[at] + np.clip(shift, -0.5, 0.5) * (x[1] - x[0]))
