@@ -39,14 +39,17 @@ def video_of(simulation: Simulation) -> Video:
     return Video("synthetic", sequence.images, sequence.image_size, sequence.timestamps)
 
 
-def masks_of(simulation: Simulation, depths: np.ndarray | None = None, tracks: Tracks | None = None) -> MotionMasks:
+def masks_of(
+    simulation: Simulation, depths: np.ndarray | None = None, tracks: Tracks | None = None,
+    world_T_cam: np.ndarray | None = None,
+) -> MotionMasks:  # fmt: skip
     sequence = simulation.sequence
     tracks = sequence.tracks if tracks is None else tracks
     assert tracks is not None
     # The images are small.
     config = MotionMaskConfig(baselines=(2, 5), depth_edge_px=7, smoothing_px=6, grow_px=1)
     source = sequence.depths if depths is None else ArrayFrames(depths)
-    return motion_masks(video_of(simulation), source, tracks, sequence.intrinsics, config)
+    return motion_masks(video_of(simulation), source, tracks, sequence.intrinsics, config, world_T_cam=world_T_cam)
 
 
 def overlap(found: np.ndarray, true: np.ndarray) -> float:
@@ -264,6 +267,19 @@ def test_the_cameras_are_not_drawn_to_what_moves(moving_scene: Simulation, movin
     miss = found.apply(moving_result.cameras.world_T_cam[:, :3, 3]) - truth.world_T_cam[:, :3, 3]
     assert np.sqrt((miss**2).sum(axis=1).mean()) < 0.02
     assert abs(moving_result.cameras.intrinsics[0] / 150.0 - 1) < 0.15
+
+
+def test_cameras_that_are_known_are_not_solved(moving_scene: Simulation, moving_result: MotionMasks) -> None:
+    poses = moving_scene.sequence.ground_truth.world_T_cam
+    assert poses is not None
+    result = masks_of(moving_scene, world_T_cam=poses)
+    np.testing.assert_array_equal(result.cameras.world_T_cam, poses)
+    np.testing.assert_array_equal(result.cameras.log_scale, 0.0)
+    found, solved = (overlap(np.stack(list(one.labels)), moving_scene.masks) for one in (result, moving_result))
+    assert found > max(0.7, solved - 0.02)
+    moves = moving_scene.tracks.instance > 0
+    assert result.tracks.moving[moves].mean() > 0.9
+    assert result.tracks.moving[~moves].mean() < 0.12
 
 
 def test_nothing_is_masked_in_a_static_scene(static_scene: Simulation) -> None:

@@ -104,7 +104,8 @@ class MotionMaskConfig(Section):
     instances: InstanceConfig = setting(InstanceConfig(join_parts=True), "How regions are joined to instances.")
     camera_rounds: int = setting(
         2,
-        "Cameras are solved and tracks tested this often, each time without the tracks that were found to move.",
+        "Cameras are solved and tracks tested this often, each time without the tracks that were found to move, where "
+        "depth was given; depth from motion has cameras of its own.",
         ge=1,
     )
     first_guess_min_tracks: int = setting(12, "Frames that share fewer tracks take no part in the first guess.", ge=4)

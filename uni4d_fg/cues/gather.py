@@ -21,6 +21,7 @@ from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_ma
 from uni4d_fg.cues.plan import GUESSED, CuePlan, CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.cues.start_doubts import doubts_of_masks
+from uni4d_fg.cues.structure.motion import StartCameras
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.bars import without_bars
@@ -107,6 +108,7 @@ class _Gathering:
             self.config = config.model_copy(update={"input": config.input.model_copy(update={"intrinsics": "fixed"})})
         self.moving_tracks: BoolArray | None = None
         self.motion_has_parallax = False
+        self.is_read_at_once = True
         self.motion_facts: list[str] = []
         self.motion_warnings: list[str] = []
         self._video_key: str | None = None
@@ -231,10 +233,13 @@ class _Gathering:
             lower = settings.model_copy(update={"min_parallax_px": _LESS_PARALLAX * settings.min_parallax_px})
             config = config.model_copy(update={"geometric_depth": lower})
         masked = replace(video, masks=masks)
+        start = None
+        if self.motion_has_parallax and self.cameras_of_motion is not None and self.intrinsics_of_motion is not None:
+            start = StartCameras(self.cameras_of_motion, self.intrinsics_of_motion)
 
         def from_motion(intrinsics: FloatArray) -> GeometricDepth:
             return geometric_depth(
-                masked, tracks, static, intrinsics, self._known_camera(), self._key(), self.folder, config,
+                masked, tracks, static, intrinsics, self._known_camera(), start, self._key(), self.folder, config,
                 self.reporter, self.should_stop,
             )  # fmt: skip
 
@@ -249,7 +254,7 @@ class _Gathering:
         self.moving_tracks = found.moving
         self.intrinsics_of_motion, self.focal_sigma = found.intrinsics, found.focal_sigma
         if found.has_parallax:
-            self.camera = found.camera
+            self.camera, self.is_read_at_once = found.camera, found.is_read_at_once
         if video.intrinsics is None:
             report.sources["intrinsics"] = "from camera motion"
         self.motion_facts = [f"depth: {fact}" for fact in found.facts]
@@ -270,7 +275,8 @@ class _Gathering:
         tracks = self._any_tracks()
         masks, facts, warnings = moving_masks(
             self.video, depths, tracks, self._best_camera(), self._key(), _name_of(depths), self.moving_tracks,
-            self.folder, self.config, self.reporter, self.should_stop,
+            self.cameras_of_motion if self.motion_has_parallax else None, self.folder, self.config, self.reporter,
+            self.should_stop,
         )  # fmt: skip
         self.report.facts += [f"masks: {fact}" for fact in facts]
         self.report.warnings += warnings
@@ -279,12 +285,14 @@ class _Gathering:
     def _known_camera(self) -> CameraModel | None:
         """Return a lens or a zoom that needs not be looked for; None lets the tracks tell.
 
-        A lens that was found among things that move is looked for again once they are masked: they can mimic one. A
-        zoom changes much more, and its search takes twice as long.
+        A lens that was found among things that move is looked for again once they are masked: they can mimic one. But
+        if all tracks of the picture ask for none, those that are left after masking hardly do. A zoom changes much
+        more, and its search takes twice as long.
         """
         camera = self.camera
-        known = camera is not None and (camera.zoom is not None or not self.video.lens.is_pinhole)
-        return camera if known else None
+        if camera is None or camera.zoom is not None or not self.video.lens.is_pinhole:
+            return camera
+        return CameraModel(self._start_intrinsics()) if camera.is_plain and self.is_read_at_once else None
 
     def _best_camera(self) -> CameraModel:
         """Return what is known of the camera so far, its lens and zoom too."""

@@ -29,11 +29,13 @@ from uni4d_fg.cues.interpolated_depth import (
 from uni4d_fg.cues.moving_things import Sightings, place_moving
 from uni4d_fg.cues.start_doubts import start_doubts, start_summary
 from uni4d_fg.cues.structure.motion import (
+    StartCameras,
     Structure,
     observations_of_tracks,
     rotations_only,
     structure_from_motion,
 )
+from uni4d_fg.cues.structure.rotation_focal import focal_of_rotations
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
@@ -72,6 +74,8 @@ class GeometricDepth:
     """What was found, one line each."""
     warnings: tuple[str, ...]
     """What to distrust besides the scale, which is never metric; one line each."""
+    is_read_at_once: bool = True
+    """False if the tracks ask for a rolling shutter."""
     start: dict[str, Any] = field(default_factory=dict)
     """What the motion leaves open, for the summary of a run: ``focal_interval_px`` (95 %), ``stretch_along_view`` (by
     which factors depth and motion along the viewing direction may be wrong), ``unexplained`` (part of the held-out
@@ -93,6 +97,7 @@ def depth_from_motion(
     should_stop: Callable[[], bool] | None = None,
     with_doubts: bool = True,
     camera: CameraModel | None = None,
+    start: StartCameras | None = None,
 ) -> GeometricDepth:
     """Find cameras and up-to-scale depth from tracks of the static scene.
 
@@ -106,8 +111,9 @@ def depth_from_motion(
         reporter: Progress.
         should_stop: Polled often.
         with_doubts: Also look for what the motion leaves open; not needed of what only leads to masks.
-        camera: A lens or a zoom that is known, with the intrinsics to start from; None looks for one, as section
-            ``camera`` says.
+        camera: A lens or a zoom that is known, with the intrinsics to start from, or a pinhole if there is none; None
+            looks for one, and for a rolling shutter, as section ``camera`` says.
+        start: Cameras that were found before; they are taken where they explain the tracks best.
 
     Raises:
         InputError: If tracks, video and ``is_static`` do not fit each other.
@@ -129,12 +135,13 @@ def depth_from_motion(
         )
     structure = structure_from_motion(
         observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop, with_doubts,
-        camera=camera, any_camera=camera is None, blur_px=tracks.blur_px,
+        camera=camera, any_camera=camera is None, blur_px=tracks.blur_px, start=start,
     )  # fmt: skip
     if structure is None:
         ideal = camera or CameraModel(intrinsics)
         observations = ideal.ideal_observations(observations)
-        return _without_parallax(video, tracks, is_static, observations, ideal, config.geometric_depth)
+        is_sought = ideal.is_plain and config.input.intrinsics == "free"
+        return _without_parallax(video, tracks, is_static, observations, ideal, config.geometric_depth, is_sought)
     return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
 
 
@@ -180,7 +187,7 @@ def _with_maps(
     moving[structure.track] = structure.moving
     return GeometricDepth(
         depths, structure.world_T_cam, structure.camera, sparse, moving, True, structure.focal_sigma, facts, warnings,
-        start,
+        structure.readout is None, start,
     )  # fmt: skip
 
 
@@ -324,9 +331,18 @@ def _without_parallax(
     observations: Observations,
     camera: CameraModel,
     config: GeometricDepthConfig,
+    is_sought: bool,
 ) -> GeometricDepth:
-    """Return depth for a camera that stays in one place: a sphere around it, which a rotation does not change."""
+    """Return depth for a camera that stays in one place: a sphere around it, which a rotation does not change.
+
+    Its focal length is found from the rotations where ``is_sought``.
+    """
     height, width = video.image_size
+    found = None
+    if is_sought:
+        found = focal_of_rotations(observations, video.num_frames, video.image_size, camera.intrinsics, config)
+    if found is not None:
+        camera = camera.with_intrinsics(np.array([found.focal, found.focal, *camera.intrinsics[2:]]))
     intrinsics = camera.intrinsics
     nodes = np.stack(
         np.meshgrid(
@@ -342,13 +358,22 @@ def _without_parallax(
     seen = tracks.visible & is_static[:, None]
     sparse[seen] = _on_sphere(tracks.uv[seen].astype(np.float64), intrinsics, config.median_depth)
     poses = rotations_only(observations, video.num_frames, intrinsics)
-    warnings = (
+    warnings: tuple[str, ...] = (
         "the camera only rotates (a pure rotation explains the tracks to within "
         f"{config.min_parallax_px:g} px), so depth cannot be seen: everything was put at distance "
         f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
     )
+    facts: tuple[str, ...] = ("no parallax",)
+    if found is not None:
+        facts += (f"rotations tell a focal length of {found.focal:.1f} px, to {100 * found.sigma:.0f} %",)
+    elif is_sought:
+        warnings += (
+            f"the camera turns too little to tell its focal length: {intrinsics[0]:.0f} px is a guess, and rotations "
+            "err as much as it does; give K.npy",
+        )
     moving = np.zeros(tracks.num_tracks, dtype=bool)
-    return GeometricDepth(depths, poses, camera, sparse, moving, False, 0.0, ("no parallax",), warnings)
+    sigma = 0.0 if found is None else found.sigma
+    return GeometricDepth(depths, poses, camera, sparse, moving, False, sigma, facts, warnings)
 
 
 def _on_sphere(uv: FloatArray, intrinsics: FloatArray, radius: float) -> FloatArray:

@@ -19,6 +19,7 @@ from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.interpolated_depth import GridDepths, InterpolatedDepths
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
+from uni4d_fg.cues.structure.motion import StartCameras
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import MaskFolder
@@ -35,7 +36,8 @@ _RECORD = "start"
 
 def geometric_depth(
     video: Video, tracks: Tracks, is_static: BoolArray, intrinsics: FloatArray, camera: CameraModel | None,
-    images_key: str, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
+    start: StartCameras | None, images_key: str, folder: Path, config: Config, reporter: Reporter,
+    should_stop: ShouldStop,
 ) -> GeometricDepth:  # fmt: skip
     """Find depth from the motion of the camera, unless it is there already.
 
@@ -44,7 +46,8 @@ def geometric_depth(
         tracks: K tracks.
         is_static: (K,) which of them may be believed to stand still.
         intrinsics: (4,) px, known or to start from.
-        camera: A lens or a zoom that is known; None looks for one.
+        camera: A lens or a zoom that is known, or a pinhole if there is none; None looks for one.
+        start: Cameras that were found before; None for none.
         images_key: Key of the images.
         folder: Of the cues.
         config: Of all parts.
@@ -59,6 +62,7 @@ def geometric_depth(
     key = maker_key(
         config.geometric_depth, config.bundle_adjustment, config.input, config.camera, images_key, _tracks_key(tracks),
         _digest(is_static), intrinsics.tolist(), _camera_key(camera), masks_key(video),
+        "" if start is None else _digest(start.world_T_cam, start.intrinsics),
     )  # fmt: skip
     target = folder / "depth" / f"motion-{key}"
     cache = FrameCache(target)
@@ -68,8 +72,9 @@ def geometric_depth(
     names = [f"{frame:06d}" for frame in range(video.num_frames)]
     if stored is None or not (leads_to_masks or all(cache.has_map(name, video.image_size) for name in names)):
         result = depth_from_motion(
-            video, tracks, is_static, intrinsics, config, reporter, should_stop, not leads_to_masks, camera
-        )
+            video, tracks, is_static, intrinsics, config, reporter, should_stop, not leads_to_masks, camera,
+            start,
+        )  # fmt: skip
         arrays: dict[str, npt.NDArray[Any]] = {}
         if leads_to_masks:
             arrays["grids"] = np.stack(_grids(result.depths, reporter, should_stop))
@@ -80,11 +85,12 @@ def geometric_depth(
         cache.put_arrays(
             _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
             moving=result.moving, has_parallax=np.array([result.has_parallax]),
+            is_read_at_once=np.array([result.is_read_at_once]),
             focal_sigma=np.array([result.focal_sigma]), camera=result.camera.to_array(), said=np.array(said), **arrays,
         )  # fmt: skip
         stored = _stored_structure(cache, tracks, leads_to_masks)
         assert stored is not None
-    facts, warnings, start = json.loads(str(stored["said"]))
+    facts, warnings, summary = json.loads(str(stored["said"]))
     depths: FrameSource[Float32Array]
     if leads_to_masks:
         depths = GridDepths(tuple(stored["grids"].astype(np.float32)), video.image_size, target.name)
@@ -93,7 +99,8 @@ def geometric_depth(
     camera = CameraModel.of_array(stored["camera"], stored["intrinsics"])
     return GeometricDepth(
         depths, stored["world_T_cam"], camera, stored["sparse"].astype(np.float32), stored["moving"],
-        bool(stored["has_parallax"][0]), float(stored["focal_sigma"][0]), tuple(facts), tuple(warnings), start,
+        bool(stored["has_parallax"][0]), float(stored["focal_sigma"][0]), tuple(facts), tuple(warnings),
+        bool(stored["is_read_at_once"][0]), summary,
     )  # fmt: skip
 
 
@@ -108,7 +115,7 @@ def _grids(depths: FrameSource[Float32Array], reporter: Reporter, should_stop: S
 
 def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> dict[str, npt.NDArray[Any]] | None:
     ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "moving": 1, "said": None}
-    ranks |= {"has_parallax": 1, "focal_sigma": 1, "camera": 1}
+    ranks |= {"has_parallax": 1, "is_read_at_once": 1, "focal_sigma": 1, "camera": 1}
     ranks |= {"grids": 3} if with_grids else {}
     stored = cache.arrays(_RECORD, ranks)
     return stored if stored is not None and stored["sparse"].shape == tracks.visible.shape else None
@@ -116,9 +123,12 @@ def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> di
 
 def moving_masks(
     video: Video, depths: FrameSource[Float32Array], tracks: Tracks, camera: CameraModel, images_key: str,
-    depth_key: str, moving: BoolArray | None, folder: Path, config: Config, reporter: Reporter, should_stop: ShouldStop,
+    depth_key: str, moving: BoolArray | None, world_T_cam: FloatArray | None, folder: Path, config: Config,
+    reporter: Reporter, should_stop: ShouldStop,
 ) -> tuple[MaskFolder, list[str], list[str]]:  # fmt: skip
-    """Find what moves, unless that is there already; ``moving`` (K,) are tracks of which it is known.
+    """Find what moves, unless that is there already.
+
+    ``moving`` (K,) are tracks of which it is known, ``world_T_cam`` (T, 4, 4) poses that are, in the unit of the depth.
 
     Returns:
         T maps of ids, facts and warnings.
@@ -131,7 +141,7 @@ def moving_masks(
     key = maker_key(
         config.motion_masks, config.camera_init, config.bundle_adjustment, config.geometric_depth, config.labels,
         config.input, *solver_settings(config), images_key, depth_key, _tracks_key(tracks), camera.intrinsics.tolist(),
-        _camera_key(camera), "" if moving is None else _digest(moving),
+        _camera_key(camera), *("" if known is None else _digest(known) for known in (moving, world_T_cam)),
     )  # fmt: skip
     target = folder / "masks" / f"motion-{key}"
     cache = FrameCache(target)
@@ -140,8 +150,9 @@ def moving_masks(
         facts, warnings = json.loads(str(said["said"]))
         return open_labels(target, video.num_frames, video.image_size), facts, warnings
     result = motion_masks(
-        video, depths, tracks, camera.intrinsics, config.motion_masks, reporter, should_stop, config, moving, camera
-    )
+        video, depths, tracks, camera.intrinsics, config.motion_masks, reporter, should_stop, config, moving, camera,
+        world_T_cam,
+    )  # fmt: skip
     cache.put_arrays("said", said=np.array(json.dumps([result.facts, result.warnings])))
     masks = store_labels(iter(result.labels), video.num_frames, video.image_size, target, "masks to disk", reporter)
     return masks, list(result.facts), list(result.warnings)

@@ -1,8 +1,8 @@
 """Masks of what moves, from tracks, depth and images alone: for videos without a segmenter.
 
-1. Tracks that contradict a static scene by themselves are known (:mod:`uni4d_fg.cues.structure`). Cameras are solved
-   from the others, robustly; tracks that depart from the static scene are found (:mod:`uni4d_fg.cues.track_motion`);
-   cameras are solved once more without them, and the tracks tested again.
+1. Tracks that contradict a static scene by themselves are known (:mod:`uni4d_fg.cues.structure`), and others that
+   depart from it are found (:mod:`uni4d_fg.cues.track_motion`). Where the cameras are not those of structure from
+   motion, they are solved before, robustly, and once more without what was found, and the tracks tested again.
 2. Every frame is compared with others before and after it as a static scene would look there
    (:mod:`uni4d_fg.cues.appearance`). Of the two directions the less suspicious one counts: what is hidden in one is
    mostly seen in the other.
@@ -78,6 +78,7 @@ def motion_masks(
     solver: Config | None = None,
     known_moving: BoolArray | None = None,
     camera: CameraModel | None = None,
+    world_T_cam: FloatArray | None = None,
 ) -> MotionMasks:
     """Find what moves in a video by comparing it with a static scene.
 
@@ -93,6 +94,7 @@ def motion_masks(
         known_moving: (K,) tracks that are known to contradict a static scene; None lets them be found from the tracks
             alone (:mod:`uni4d_fg.cues.structure`), as a thing that moves by little stays within the sigmas of depth.
         camera: A lens or a zoom that is known, with its intrinsics, which are held; None for a pinhole.
+        world_T_cam: (T, 4, 4) poses that are known, in the unit of the depth; None solves them from depth and tracks.
 
     Raises:
         InputError: If depth or tracks do not fit the images, or depth is missing wherever there is a track.
@@ -109,9 +111,9 @@ def motion_masks(
     ideal = camera.ideal_tracks(tracks)
     if known_moving is None:
         known_moving = _contradicting(ideal, video.image_size, intrinsics, settings, report, stop)
-    report.begin("motion of tracks", config.camera_rounds)
+    report.begin("motion of tracks", config.camera_rounds if world_T_cam is None else 1)
     cameras, motion = _tracks_and_cameras(
-        video, depths, tracks, ideal, camera, known_moving, config, settings, report, stop
+        video, depths, tracks, ideal, camera, known_moving, world_T_cam, config, settings, report, stop
     )
     report.end()
     report.begin("motion masks", video.num_frames)
@@ -155,12 +157,13 @@ def _tracks_and_cameras(
     ideal: Tracks,
     camera: CameraModel,
     known_moving: BoolArray,
+    world_T_cam: FloatArray | None,
     config: MotionMaskConfig,
     settings: Config,
     report: Reporter,
     stop: Callable[[], bool],
 ) -> tuple[Cameras, TrackMotion]:
-    """Solve cameras, test tracks, and do both once more without the tracks that move."""
+    """Test tracks with the cameras that are known, or solve cameras, test, and do both without the tracks that move."""
     intrinsics = camera.intrinsics
     known = StaticTracks.of(video, depths, tracks, intrinsics, settings)
     if not np.isfinite(known.labelled.depth).any():
@@ -170,9 +173,18 @@ def _tracks_and_cameras(
         )
     spread = spread_at_tracks(tracks, depths, max(1, round(config.depth_edge_px)))
     labelled = replace(known.labelled, tracks=ideal)
+
+    def tested(cameras: Cameras, outlier: BoolArray, with_shared: bool) -> TrackMotion:
+        motion = find_moving_tracks(labelled, spread, cameras, video.image_size, config, outlier, with_shared)
+        return replace(motion, moving=motion.moving | outlier, static=motion.static & ~outlier)
+
+    if world_T_cam is not None:
+        cameras = Cameras(world_T_cam, intrinsics, np.zeros(len(world_T_cam)))
+        motion = tested(cameras, known_moving, with_shared=True)
+        report.advance(1)
+        return cameras, motion
     outlier = find_outlier_tracks(labelled, intrinsics, config, known_moving) | known_moving
     moving = outlier
-    cameras, motion = None, None
     for turn in range(config.camera_rounds):
         cameras = solve_cameras(
             labelled.without(moving),
@@ -183,13 +195,9 @@ def _tracks_and_cameras(
             observations_per_frame=config.max_bundle_observations,
             should_stop=stop,
         )
-        is_last = turn == config.camera_rounds - 1
-        motion = find_moving_tracks(labelled, spread, cameras, video.image_size, config, outlier, with_shared=is_last)
-        motion = replace(motion, moving=motion.moving | outlier, static=motion.static & ~outlier)
+        motion = tested(cameras, outlier, with_shared=turn == config.camera_rounds - 1)
         moving = motion.moving
         report.advance(turn + 1)
-    assert cameras is not None
-    assert motion is not None
     return cameras, motion
 
 

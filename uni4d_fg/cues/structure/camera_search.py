@@ -162,19 +162,9 @@ def part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> Growin
 
 def _scene_of(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
     """Return what the cameras of a scene see of other observations, trimmed."""
-    scene = seen_by(cameras, ideal)
+    scene = cameras.seeing(ideal)
     trim(scene)
     scene.measure_noise()
-    return scene
-
-
-def seen_by(cameras: GrowingScene, ideal: Observations) -> GrowingScene:
-    """Return a scene of other observations with the cameras of one that is grown."""
-    scene = GrowingScene.empty(
-        ideal.with_min_observations(2), len(cameras.registered), cameras.intrinsics, cameras.config,
-        free_focal=cameras.free_focal, prior_intrinsics=cameras.prior_intrinsics, should_stop=cameras.should_stop,
-    )  # fmt: skip
-    scene.continue_from(cameras)
     return scene
 
 
@@ -189,7 +179,7 @@ class _Judge:
     def energies(self, fitted: _Fitted) -> FloatArray:
         """Return the mean robust energy (K,) of each track on real pixels; NaN where its rays are too parallel."""
         tracks, _ = self.real.rows()
-        scene = seen_by(fitted.scene, fitted.camera.ideal_observations(self.real))
+        scene = fitted.scene.seeing(fitted.camera.ideal_observations(self.real))
         seen = scene.observations
         size = fitted.camera.ideal_weight(seen.uv, seen.frame)
         error = np.minimum(scene.errors() * np.sqrt(size) / self.sigma_px, _LOST)

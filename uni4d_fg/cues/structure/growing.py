@@ -133,11 +133,20 @@ class GrowingScene:
         self.registered[frames] = False
         self._judge()
 
-    def continue_from(self, other: GrowingScene) -> None:
-        """Take the cameras of a scene of the same frames, and triangulate what they see."""
-        self.world_T_cam, self.registered = other.world_T_cam.copy(), other.registered.copy()
-        self.intrinsics = other.intrinsics.copy()
-        self.triangulate_all()
+    def seeing(self, observations: Observations, config: Config | None = None) -> GrowingScene:
+        """Return a scene of other tracks of the same frames, triangulated with the cameras of this one.
+
+        Args:
+            observations: Those of tracks that are seen once are left out.
+            config: None takes that of this scene.
+        """
+        other = GrowingScene.empty(
+            observations.with_min_observations(2), len(self.registered), self.intrinsics, config or self.config,
+            free_focal=self.free_focal, prior_intrinsics=self.prior_intrinsics, should_stop=self.should_stop,
+        )  # fmt: skip
+        other.world_T_cam, other.registered = self.world_T_cam.copy(), self.registered.copy()
+        other.triangulate_all()
+        return other
 
     def triangulate(self, which: BoolArray, posed: int | None = None) -> None:
         """Triangulate tracks (M,) from the frames that have a pose; what does not fit stays without a point.

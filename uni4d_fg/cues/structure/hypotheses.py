@@ -36,10 +36,12 @@ _OVERLAP = 0.5
 _BESIDE_A_WALL = 2.0
 """A pair will do, too, if a quarter of the tracks has so many times the parallax that the median needs: the rest may be
 a wall."""
+_SIDE = 0.25
+"""Part of the picture's width that a side of it has."""
 
-
-Part = Literal["majority", "minority", "all"]
-"""Tracks that agree with the epipolar geometry of most of the picture, those that do not, or both."""
+Part = Literal["majority", "minority", "all", "sides"]
+"""Tracks that agree with the epipolar geometry of most of the picture, those that do not, or both; or those at the left
+and right of the picture."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,18 @@ class Competition:
             found = ranked(found + [hypothesis for hypothesis in tried if hypothesis is not None])
         return found
 
+    def at_sides(self) -> Hypothesis | None:
+        """Return the start from what is seen at the sides of the picture; None where that gives no scene.
+
+        A person who hardly moves but fills the middle of the picture bends every start that is made with them, so that
+        no majority is left: beside them the scene is seen alone, and with its cameras they are told apart.
+
+        Raises:
+            Cancelled: If asked to stop.
+        """
+        pairs = self.pairs("sides")
+        return self.trial(pairs[0], self.factors()[0], "sides") if pairs else None
+
     def factors(self) -> list[float]:
         """Return the focal lengths to start from, as parts of the given ones; that for all pairs first."""
         starts = [1.0, *(factor for factor in self.config.geometric_depth.focal_starts if factor != 1.0)]
@@ -124,6 +138,8 @@ class Competition:
         """Return (N,) which observations belong to a part of the tracks."""
         if part == "all":
             return np.ones(len(self.outlier), dtype=bool)
+        if part == "sides":
+            return at_sides(self.observations, self.image_size)
         return self.outlier if part == "minority" else ~self.outlier
 
     def pairs(self, part: Part) -> list[FramePair]:
@@ -163,12 +179,27 @@ class Competition:
             grow(scene, SilentReporter(), growth=_TRIAL_GROWTH)
         except SolverError:
             return None
+        return self._judged(scene, pair, part, frames, judged.select(kept_out))
+
+    def of_grown(self, scene: GrowingScene, pair: FramePair) -> Hypothesis:
+        """Return the cameras of a grown scene as a start from a pair, judged like the others."""
+        settings = self.config.geometric_depth
+        frames = trial_frames(pair, self.num_frames, settings.trial_step, settings.trial_frames)
+        _, judged, kept_out = self._picked(frames)
+        part = scene.seeing(judged.select(~kept_out), _quick(self.config))
+        part.take_out(np.setdiff1d(np.arange(self.num_frames), frames))
+        return self._judged(part, pair, "all", frames, judged.select(kept_out))
+
+    def _judged(
+        self, scene: GrowingScene, pair: FramePair, part: Part, frames: IntArray, kept_out: Observations
+    ) -> Hypothesis:
+        settings = self.config.geometric_depth
         focal = scene.mean_focal / max(self.image_size)
         is_usual = settings.usual_focal[0] <= focal <= settings.usual_focal[1] or not self.free_focal
-        kept = HeldOut.of(scene, judged.select(kept_out), self.image_size)
+        held_out = HeldOut.of(scene, kept_out, self.image_size)
         return Hypothesis(
-            pair, part, scene, frames, held_out=kept, noise_px=scene.noise_of_good(), is_usual=is_usual,
-            misfit=kept.unexplained(settings.max_reprojection_px),
+            pair, part, scene, frames, held_out, noise_px=scene.noise_of_good(), is_usual=is_usual,
+            misfit=held_out.unexplained(settings.max_reprojection_px),
         )  # fmt: skip
 
     def _picked(self, frames: IntArray) -> tuple[IntArray, Observations, BoolArray]:
@@ -198,6 +229,15 @@ def ranked(found: list[Hypothesis]) -> list[Hypothesis]:
         limit = min(_SIGMAS * noise, config.geometric_depth.max_reprojection_px)
         found = [replace(one, misfit=one.held_out.unexplained(limit)) for one in found]
     return sorted(found, key=lambda one: one.cost)
+
+
+def at_sides(observations: Observations, image_size: tuple[int, int]) -> BoolArray:
+    """Return (N,) which observations are of tracks that are seen at the left or right of the picture, in the mean."""
+    tracks, row = observations.rows()
+    x = np.bincount(row, observations.uv[:, 0], len(tracks)) / np.bincount(row, minlength=len(tracks))
+    width = image_size[1]
+    beside = (x < _SIDE * width) | (x > (1.0 - _SIDE) * width)
+    return np.asarray(beside[row])
 
 
 def trial_frames(pair: FramePair, num_frames: int, steps: int, count: int) -> IntArray:

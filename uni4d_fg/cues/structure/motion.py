@@ -19,6 +19,7 @@ from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
+from uni4d_fg.cues.structure.judging import errors_of
 from uni4d_fg.cues.structure.readout import at_one_time, find_readout, is_told_still
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import Rival, rivals_of
@@ -32,7 +33,7 @@ from uni4d_fg.cues.structure.triangulation import (
     reprojection_errors,
     triangulate,
 )  # fmt: skip
-from uni4d_fg.cues.structure.trimming import trim_and_converge
+from uni4d_fg.cues.structure.trimming import trim, trim_and_converge
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.frontend.track_model import Tracks
@@ -45,6 +46,24 @@ from uni4d_fg.slam.stages.observations import Observations
 _CLEAR_GAIN = 0.02
 """Part of the reprojection energy that a lens must take away where the focal length is open: straight forward
 k1 of -0.1 takes 0.8 to 2 %, -0.25 takes 13 %, and it is up to 1.1 % without a lens."""
+_HARDLY_TRIMMED = 0.8
+"""Part of ``max_reprojection_px`` at which a limit that follows the noise is about where it began."""
+_SHARPER = 0.85
+"""Part of a scene's sharpest errors that another one has, at most, for that to be taken: 0.48 and 0.82 where a scene is
+bent; 0.98 and more where both start alike."""
+_BLUNTER = 1.15
+"""Times the sharpest errors of a scene with a pinhole that one with a lens has, at most: up to 1.03 where there is a
+lens, as ideal pixels are larger; 1.37 where people who sit in the picture asked for one."""
+
+
+@dataclass(frozen=True)
+class StartCameras:
+    """Cameras of all frames that may be right."""
+
+    world_T_cam: FloatArray
+    """(T, 4, 4)."""
+    intrinsics: FloatArray
+    """(4,) px."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +128,7 @@ def structure_from_motion(
     any_camera: bool = False,
     proposed: CameraModel | None = None,
     blur_px: Float32Array | None = None,
+    start: StartCameras | None = None,
 ) -> Structure | None:
     """Find cameras and static points from tracks.
 
@@ -125,6 +145,7 @@ def structure_from_motion(
         any_camera: Also look for a lens and a zoom, as section ``camera`` says, where intrinsics are free.
         proposed: Then also try the zoom of this camera.
         blur_px: (T,) length of the motion blur of each frame, where it is known: sharp ones tell a lens.
+        start: Cameras that are taken instead of those that starting views lead to where they explain the tracks better.
 
     Returns:
         The structure, or None if no two frames have enough parallax to see depth.
@@ -137,7 +158,7 @@ def structure_from_motion(
     free_focal = config.input.intrinsics == "free"
     if should_stop():
         raise Cancelled("structure from motion stopped")
-    search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop)
+    search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop, start)
     known, seen = camera, observations
     if camera is None or camera.is_plain:
         camera = CameraModel(intrinsics)
@@ -167,13 +188,13 @@ def structure_from_motion(
             if again is not None:
                 is_lens = not found.camera.lens.is_pinhole
                 is_open = is_lens and any(focal_is_open(each.scene, image_size) for each in (grown, again))
-                taken = not is_lens or search.tells_lens(again, found, is_open)
+                taken = not is_lens or search.tells_lens(grown, observations, again, ideal, found, is_open)
                 if is_open or (taken and search.is_weak(found.camera)):
                     beside = [(grown if taken else again).scene.mean_focal]
                 if taken and readout is not None and not is_told_still(again.scene, ideal, readout, image_size):
                     return structure_from_motion(
                         seen, num_frames, image_size, intrinsics, without_rolling_shutter(config), reporter,
-                        should_stop, with_doubts, known, any_camera, proposed, blur_px,
+                        should_stop, with_doubts, known, any_camera, proposed, blur_px, start,
                     )  # fmt: skip
                 if taken:
                     grown, camera, observations = again, found.camera, ideal
@@ -225,6 +246,7 @@ class _Search:
     config: Config
     reporter: Reporter
     should_stop: Callable[[], bool]
+    start: StartCameras | None = None
 
     def grow(self, observations: Observations, intrinsics: FloatArray, free_focal: bool) -> _Grown | None:
         """Let starts compete, and grow and trim the best; None if no two frames have parallax."""
@@ -241,15 +263,40 @@ class _Search:
         self.reporter.end()
         if not hypotheses:
             return None
-        best = hypotheses[0]
-        scene = GrowingScene.empty(
-            used.select(competition.chosen(best.tracks)), self.num_frames, best.scene.intrinsics, self.config,
-            free_focal=free_focal, prior_intrinsics=self.prior_intrinsics, should_stop=self.should_stop,
+        scene = self._grown_from(hypotheses[0], used.select(competition.chosen(hypotheses[0].tracks)))
+        if self.start is not None:
+            other = self._continued(self.start, scene, used)
+            if _sharpness(other, used) < _SHARPER * _sharpness(scene, used):
+                scene, hypotheses = other, [competition.of_grown(other, hypotheses[0].pair)]
+        if _is_bent(scene) and (start := competition.at_sides()) is not None:
+            trim(start.scene)
+            other = self._grown_from(start, used)
+            if _sharpness(other, used) < _SHARPER * _sharpness(scene, used):
+                scene, hypotheses = other, [competition.of_grown(other, start.pair)]
+        return _Grown(scene, hypotheses)
+
+    def _grown_from(self, start: Hypothesis, observations: Observations) -> GrowingScene:
+        """Grow a start over all frames, with tracks that may be others than those of its trial, and trim it."""
+        scene = start.scene.seeing(observations, self.config)
+        scene.prior_intrinsics = self.prior_intrinsics
+        if start.tracks == "sides":
+            trim(scene)
+        return self._grown_to_the_end(scene)
+
+    def _continued(self, start: StartCameras, scene: GrowingScene, observations: Observations) -> GrowingScene:
+        """Return a scene that begins with cameras of all frames, with the settings of another one."""
+        cameras = replace(
+            scene, world_T_cam=start.world_T_cam, intrinsics=start.intrinsics,
+            registered=np.ones(self.num_frames, dtype=bool),
         )  # fmt: skip
-        scene.continue_from(best.scene)
+        other = cameras.seeing(observations)
+        trim(other)
+        return self._grown_to_the_end(other)
+
+    def _grown_to_the_end(self, scene: GrowingScene) -> GrowingScene:
         grow(scene, self.reporter)
         trim_and_converge(scene)
-        return _Grown(nearer_to_the_tracks(scene), hypotheses)
+        return nearer_to_the_tracks(scene)
 
     def at_one_time(
         self, grown: _Grown, observations: Observations, intrinsics: FloatArray
@@ -274,12 +321,19 @@ class _Search:
         usual = np.array(self.config.geometric_depth.usual_focal) * max(self.image_size)
         return focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
 
+    def sharpness(self, grown: _Grown, observations: Observations) -> float:
+        """Return how well a scene explains what it explains best, see :func:`_sharpness`."""
+        used = spread_tracks(observations, self.image_size, self.config.geometric_depth.max_tracks)
+        return _sharpness(grown.scene, observations.select(used))
+
     def is_weak(self, camera: CameraModel) -> bool:
         """Tell whether a lens bends images so little that errors of tracks may do the same."""
         return lens_strength(camera, self.image_size, self.config) is Strength.WEAK
 
-    def tells_lens(self, grown: _Grown, found: FoundCamera, is_open: bool) -> bool:
-        """Tell whether tracks that leave a lens, and a scene grown with it, leave no doubt of the lens.
+    def tells_lens(
+        self, plain: _Grown, real: Observations, grown: _Grown, ideal: Observations, found: FoundCamera, is_open: bool
+    ) -> bool:
+        """Tell whether tracks that leave a lens (``real``, ``ideal``), and scenes without and with it, leave no doubt.
 
         Where they leave the focal length open (``is_open``), as straight forward, they leave distortion open as well,
         unless it explains much. A weak lens is also doubted where starts end at focal lengths so far from each other
@@ -287,11 +341,26 @@ class _Search:
         """
         if is_open and found.lens_gain < _CLEAR_GAIN:
             return False
+        if self.sharpness(grown, ideal) > _BLUNTER * self.sharpness(plain, real):
+            return False
         if not self.is_weak(found.camera):
             return True
         rivals = rivals_of(grown.hypotheses, grown.scene.world_T_cam)
         focal = grown.scene.mean_focal
         return self.holding_rivals(FocalInterval(focal, focal), rivals).reach(focal) <= OPEN_FOCAL
+
+
+def _sharpness(scene: GrowingScene, observations: Observations) -> float:
+    """Return the error, px, that a quarter of what is seen does not reach with the cameras of a scene.
+
+    Cameras that are bent by things that move explain as many tracks as those of the world, but none of them as well.
+    """
+    return float(np.quantile(errors_of(scene.seeing(observations), observations), 0.25))
+
+
+def _is_bent(scene: GrowingScene) -> bool:
+    """Tell whether no majority agrees with a trimmed scene to much less than tracks may be off."""
+    return bool(np.median(scene.limit_px) >= _HARDLY_TRIMMED * scene.config.geometric_depth.max_reprojection_px)
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:

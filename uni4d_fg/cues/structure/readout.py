@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
-from uni4d_fg.cues.structure.camera_search import part_of, seen_by
+from uni4d_fg.cues.structure.camera_search import part_of
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.slam.lens.readout_search import BELIEVED, FIRST, least_readout
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout
@@ -145,7 +145,7 @@ class _Trials:
         if readout not in self.known:
             seen = self.scene.observations
             uv = readout.undone(seen.uv, self.velocity, self.acceleration, self.image_size)
-            scene = seen_by(self.scene, replace(seen, uv=uv))
+            scene = self.scene.seeing(replace(seen, uv=uv))
             scene.measure_noise()
             scene.adjust(_SOLVED)
             scene.triangulate_all()
