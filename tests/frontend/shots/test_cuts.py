@@ -13,7 +13,7 @@ from uni4d_fg.config.shots import ShotsConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.sequence.open_video import open_video
-from uni4d_fg.frontend.shots.cuts import Cut, _Search, find_cuts
+from uni4d_fg.frontend.shots.cuts import Cut, _Dissolve, _Search, find_cuts
 from uni4d_fg.frontend.shots.links import small_frame
 from uni4d_fg.frontend.shots.survival import Span
 
@@ -187,3 +187,20 @@ def test_a_camera_that_follows_a_runner_dissolves_into_nothing(data_root: Path, 
     images = list(open_video(data_root / "lady_running").images)
     small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in images]
     assert find_cuts(ArrayFrames(np.stack(small[::step])), CONFIG) == ()
+
+
+@pytest.mark.parametrize(
+    ("elsewhere", "explained", "is_found"), [(0.5, 0.5, True), (0.05, 0.5, False), (0.05, 0.97, True)]
+)
+def test_where_corners_never_last_a_blend_must_explain_nearly_all(
+    elsewhere: float, explained: float, is_found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the window of a train no corner outlives half a second, and two views of it may well pass for a blend."""
+    frames = [small_frame(image, CONFIG) for image in shot(0, 40)]
+    search = _Search(frames, CONFIG)
+    search.run()
+    across = Span(14, 24, 0.03)
+    search.__dict__["spans"] = [across, *(Span(first, first + 10, elsewhere) for first in (0, 4, 26, 30))]
+    found = _Dissolve(Cut(17, 21), True, explained, (4.0, 0.0))
+    monkeypatch.setattr(_Search, "dissolve", lambda self, span: found if span is across else None)
+    assert search.dissolves() == ([Cut(17, 21)] if is_found else [])

@@ -211,6 +211,15 @@ class _Search:
         """
         return self.over(self.config.max_surviving, span)
 
+    def usually_alive(self, span: Span) -> float:
+        """Return the part of the corners that outlives spans as long as one where most do.
+
+        From the window of a train few corners outlive any half of a second, and that says nothing of a dissolve.
+        """
+        length = span.last - span.first
+        alike = [s.alive for s in self.spans if s.last - s.first == length]
+        return float(np.quantile(alike, 0.75)) if alike else 1.0
+
     def over(self, limit: float, span: Span) -> float:
         """Return a limit that holds over the shortest span for another one, in proportion to how much longer it is."""
         return limit * min(self.config.dissolve_spans) / (span.last - span.first)
@@ -220,7 +229,8 @@ class _Search:
         for span in [*self.spans, *self.gaps]:
             limit = self.surviving(span)
             candidate = self.dissolve(span) if span.alive <= 2.0 * limit else None
-            if candidate is not None and (span.alive <= limit or candidate.explained >= self.config.sure_blend):
+            few = span.alive <= limit and self.usually_alive(span) > 2.0 * limit
+            if candidate is not None and (few or candidate.explained >= self.config.sure_blend):
                 found.append(candidate)
         believed: list[_Dissolve] = []
         apart = self.config.look_around
