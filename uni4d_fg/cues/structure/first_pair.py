@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,18 +59,39 @@ def rank_pairs(
         config: Thresholds.
         known_focal: Whether the focal lengths are exact.
     """
-    sampled = evenly_spread(num_frames, config.sampled_frames).tolist()
-    common_tracks = CommonTracks(observations, num_frames)
     pairs = []
+    for seen in common_pixels(observations, num_frames, config.sampled_frames, config):
+        moved = parallax(seen.uv_first, seen.uv_second, intrinsics, known_focal=known_focal)
+        pairs.append(FramePair(seen.first, seen.second, moved, seen.common))
+    return sorted(pairs, key=lambda pair: -_worth(pair, config))
+
+
+class CommonPixels(NamedTuple):
+    """What two frames both see."""
+
+    first: int
+    second: int
+    uv_first: FloatArray
+    """(n, 2) px of some of their common tracks."""
+    uv_second: FloatArray
+    """(n, 2) px."""
+    common: int
+    """Number of tracks that both see."""
+
+
+def common_pixels(
+    observations: Observations, num_frames: int, sampled_frames: int, config: GeometricDepthConfig
+) -> Iterator[CommonPixels]:
+    """Yield every pair of evenly spaced frames that share enough tracks, with up to ``fitted_tracks`` of those."""
+    sampled = evenly_spread(num_frames, sampled_frames).tolist()
+    common_tracks = CommonTracks(observations, num_frames)
     for position, first in enumerate(sampled):
         for second in sampled[position + 1 :]:
             a, b = common_tracks.between(first, second)
             if len(a) < config.min_common_tracks:
                 break  # tracks only get fewer
             used = evenly_spread(len(a), config.fitted_tracks)
-            moved = parallax(observations.uv[a[used]], observations.uv[b[used]], intrinsics, known_focal=known_focal)
-            pairs.append(FramePair(first, second, moved, len(a)))
-    return sorted(pairs, key=lambda pair: -_worth(pair, config))
+            yield CommonPixels(first, second, observations.uv[a[used]], observations.uv[b[used]], len(a))
 
 
 def _worth(pair: FramePair, config: GeometricDepthConfig) -> float:

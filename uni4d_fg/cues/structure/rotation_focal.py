@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray, evenly_spread
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
-from uni4d_fg.cues.structure.first_pair import CommonTracks
-from uni4d_fg.cues.structure.two_view import left_by_rotations
+from uni4d_fg.cues.structure.first_pair import common_pixels
+from uni4d_fg.cues.structure.two_view import left_by_rotations, multiples
 from uni4d_fg.slam.stages.observations import Observations
 
 _FOCALS = np.geomspace(0.35, 5.0, 68)
@@ -55,20 +55,12 @@ def focal_of_rotations(
         intrinsics: (4,) px, of which the principal point serves.
         config: How many tracks of a pair of frames are needed and taken.
     """
-    tried = np.column_stack(
-        [np.tile((_FOCALS * max(image_size))[:, None], 2), np.tile(intrinsics[2:], (len(_FOCALS), 1))]
-    )
-    frames = evenly_spread(num_frames, _SAMPLED_FRAMES).tolist()
-    common = CommonTracks(observations, num_frames)
-    left = []
-    for position, first in enumerate(frames):
-        for second in frames[position + 1 :]:
-            a, b = common.between(first, second)
-            if len(a) < config.min_common_tracks:
-                break  # tracks only get fewer
-            used = evenly_spread(len(a), config.fitted_tracks)
-            pair = left_by_rotations(observations.uv[a[used]], observations.uv[b[used]], tried)
-            left.append([parallax.median for parallax in pair])
+    longer = float(max(image_size))
+    tried = multiples(np.array([longer, longer, *intrinsics[2:]]), _FOCALS)
+    left = [
+        [parallax.median for parallax in left_by_rotations(seen.uv_first, seen.uv_second, tried)]
+        for seen in common_pixels(observations, num_frames, _SAMPLED_FRAMES, config)
+    ]
     if not left:
         return None
     log_left = np.log(np.maximum(left, 1e-6))
@@ -80,7 +72,7 @@ def focal_of_rotations(
     lower, upper = np.quantile(votes, [0.25, 0.75])
     if upper - lower > np.log(_AGREED):
         return None
-    focal = float(np.exp(_least(np.log(_FOCALS), log_left[clear].mean(axis=0))) * max(image_size))
+    focal = float(np.exp(_least(np.log(_FOCALS), log_left[clear].mean(axis=0))) * longer)
     return RotationFocal(focal, max(0.5 * float(upper - lower), _LEAST_SIGMA))
 
 

@@ -79,16 +79,16 @@ def parallax(uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray
     """
     if known_focal:
         return left_by_rotations(uv_first, uv_second, intrinsics[None])[0]
-    left = left_by_rotations(uv_first, uv_second, _multiples(intrinsics, _FOCAL_FACTORS))
+    left = left_by_rotations(uv_first, uv_second, multiples(intrinsics, _FOCAL_FACTORS))
     least = min(left)
     if least.median > _DOUBTFUL_PX:
         return least
     # A camera that turns far leaves pixels at a focal length between two factors.
     finer = _FOCAL_FACTORS[left.index(least)] * _FINER_FACTORS
-    return min(least, *left_by_rotations(uv_first, uv_second, _multiples(intrinsics, finer)))
+    return min(least, *left_by_rotations(uv_first, uv_second, multiples(intrinsics, finer)))
 
 
-def _multiples(intrinsics: FloatArray, factors: FloatArray) -> FloatArray:
+def multiples(intrinsics: FloatArray, factors: FloatArray) -> FloatArray:
     """Return intrinsics (F, 4) px with focal lengths multiplied by F factors."""
     scale = np.ones((len(factors), 4))
     scale[:, :2] = factors[:, None]

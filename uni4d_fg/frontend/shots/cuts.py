@@ -211,14 +211,16 @@ class _Search:
         """
         return self.over(self.config.max_surviving, span)
 
-    def usually_alive(self, span: Span) -> float:
-        """Return the part of the corners that outlives spans as long as one where most do.
+    @cached_property
+    def usually_alive(self) -> dict[int, float]:
+        """The part of the corners that outlives spans of each length where most do.
 
         From the window of a train few corners outlive any half of a second, and that says nothing of a dissolve.
         """
-        length = span.last - span.first
-        alike = [s.alive for s in self.spans if s.last - s.first == length]
-        return float(np.quantile(alike, 0.75)) if alike else 1.0
+        alive: dict[int, list[float]] = {}
+        for span in self.spans:
+            alive.setdefault(span.last - span.first, []).append(span.alive)
+        return {length: float(np.quantile(parts, 0.75)) for length, parts in alive.items()}
 
     def over(self, limit: float, span: Span) -> float:
         """Return a limit that holds over the shortest span for another one, in proportion to how much longer it is."""
@@ -229,7 +231,7 @@ class _Search:
         for span in [*self.spans, *self.gaps]:
             limit = self.surviving(span)
             candidate = self.dissolve(span) if span.alive <= 2.0 * limit else None
-            few = span.alive <= limit and self.usually_alive(span) > 2.0 * limit
+            few = span.alive <= limit and self.usually_alive.get(span.last - span.first, 1.0) > 2.0 * limit
             if candidate is not None and (few or candidate.explained >= self.config.sure_blend):
                 found.append(candidate)
         believed: list[_Dissolve] = []
