@@ -188,7 +188,7 @@ def structure_from_motion(
             if again is not None:
                 is_lens = not found.camera.lens.is_pinhole
                 is_open = is_lens and any(focal_is_open(each.scene, image_size) for each in (grown, again))
-                taken = not is_lens or search.tells_lens(grown, observations, again, ideal, found, is_open)
+                taken = not is_lens or search.tells_lens(grown, again, found, is_open)
                 if is_open or (taken and search.is_weak(found.camera)):
                     beside = [(grown if taken else again).scene.mean_focal]
                 if taken and readout is not None and not is_told_still(again.scene, ideal, readout, image_size):
@@ -234,6 +234,8 @@ class _Grown:
     scene: GrowingScene
     hypotheses: list[Hypothesis]
     """The best first."""
+    used: Observations
+    """Those that starts were grown from."""
 
 
 @dataclass(frozen=True)
@@ -269,17 +271,19 @@ class _Search:
             if _sharpness(other, used) < _SHARPER * _sharpness(scene, used):
                 scene, hypotheses = other, [competition.of_grown(other, hypotheses[0].pair)]
         if _is_bent(scene) and (start := competition.at_sides()) is not None:
-            trim(start.scene)
             other = self._grown_from(start, used)
             if _sharpness(other, used) < _SHARPER * _sharpness(scene, used):
                 scene, hypotheses = other, [competition.of_grown(other, start.pair)]
-        return _Grown(scene, hypotheses)
+        return _Grown(scene, hypotheses, used)
 
     def _grown_from(self, start: Hypothesis, observations: Observations) -> GrowingScene:
         """Grow a start over all frames, with tracks that may be others than those of its trial, and trim it."""
+        of_some = start.tracks == "sides"
+        if of_some:
+            trim(start.scene)
         scene = start.scene.seeing(observations, self.config)
         scene.prior_intrinsics = self.prior_intrinsics
-        if start.tracks == "sides":
+        if of_some:
             trim(scene)
         return self._grown_to_the_end(scene)
 
@@ -321,19 +325,12 @@ class _Search:
         usual = np.array(self.config.geometric_depth.usual_focal) * max(self.image_size)
         return focal.holding([rival.focal for rival in rivals if usual[0] <= rival.focal <= usual[1]])
 
-    def sharpness(self, grown: _Grown, observations: Observations) -> float:
-        """Return how well a scene explains what it explains best, see :func:`_sharpness`."""
-        used = spread_tracks(observations, self.image_size, self.config.geometric_depth.max_tracks)
-        return _sharpness(grown.scene, observations.select(used))
-
     def is_weak(self, camera: CameraModel) -> bool:
         """Tell whether a lens bends images so little that errors of tracks may do the same."""
         return lens_strength(camera, self.image_size, self.config) is Strength.WEAK
 
-    def tells_lens(
-        self, plain: _Grown, real: Observations, grown: _Grown, ideal: Observations, found: FoundCamera, is_open: bool
-    ) -> bool:
-        """Tell whether tracks that leave a lens (``real``, ``ideal``), and scenes without and with it, leave no doubt.
+    def tells_lens(self, plain: _Grown, grown: _Grown, found: FoundCamera, is_open: bool) -> bool:
+        """Tell whether tracks that leave a lens, and scenes grown without and with it, leave no doubt of the lens.
 
         Where they leave the focal length open (``is_open``), as straight forward, they leave distortion open as well,
         unless it explains much. A weak lens is also doubted where starts end at focal lengths so far from each other
@@ -341,7 +338,7 @@ class _Search:
         """
         if is_open and found.lens_gain < _CLEAR_GAIN:
             return False
-        if self.sharpness(grown, ideal) > _BLUNTER * self.sharpness(plain, real):
+        if _sharpness(grown.scene, grown.used) > _BLUNTER * _sharpness(plain.scene, plain.used):
             return False
         if not self.is_weak(found.camera):
             return True
