@@ -60,6 +60,9 @@ k2 of 0.03 beside k1 of -0.1 takes 0.5 to 3.6 %."""
 _LENS_ROUNDS = 4
 _LENS_STAYS = 0.003
 """Change of k1 in a round below which it is found."""
+_HOPELESS = 0.2
+"""Part by which a lens has more energy than a rival, after a round, at which no other round follows: a scene with near
+and far exchanged that took over had 0.15 less from the first round on, one that did not had 0.66 more."""
 _ZOOM_ROUNDS = 3
 _ZOOM_STEPS = 200
 _SETTLED = 0.003
@@ -236,22 +239,23 @@ def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, confi
 
 def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     """Fit a radial lens, and from there once more with near and far exchanged."""
-    found = _with_lens(plain, judge, config)
+    found = _with_lens(plain, plain, judge, config)
     other = exchanged_and_refined(found.scene)
     # With a lens that is not its own the right scene explains less, but what it explains it explains better.
     if other is None or not other.noise_px < found.scene.noise_px:
         return found
     try:
-        mirrored = _with_lens(replace(found, scene=other), judge, config)
+        mirrored = _with_lens(replace(found, scene=other), found, judge, config)
     except SolverError:
         return found
     return mirrored if judge.better(mirrored, found)[0] > 0.0 else found
 
 
-def _with_lens(found: _Fitted, judge: _Judge, config: Config) -> _Fitted:
+def _with_lens(found: _Fitted, rival: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     """Fit one radial parameter, and a second one where there is one already or it takes energy away.
 
-    Which tracks agree, and where they are triangulated, depends on the lens: it is fitted again until it stays.
+    Which tracks agree, and where they are triangulated, depends on the lens: it is fitted again until it stays, or
+    until it explains much less than a rival.
     """
     settings = config.camera
     to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
@@ -263,6 +267,8 @@ def _with_lens(found: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     for _ in range(_LENS_ROUNDS):
         before = found.camera.lens.padded[0]
         found = judged_anew(_joint(found, first, config, to_the_end))
+        if judge.better(found, rival)[0] < -_HOPELESS:
+            return found
         if abs(found.camera.lens.padded[0] - before) < _LENS_STAYS:
             break
     if first == "RADIAL":

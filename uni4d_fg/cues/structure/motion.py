@@ -266,14 +266,14 @@ class _Search:
         if not hypotheses:
             return None
         scene = self._grown_from(hypotheses[0], used.select(competition.chosen(hypotheses[0].tracks)))
-        if self.start is not None:
-            other = self._continued(self.start, scene, used)
-            if _sharpness(other, used) < _SHARPER * _sharpness(scene, used):
+        if (start := self.start) is not None:
+            other = _if_sharper(lambda: self._continued(start, scene, used), scene, used)
+            if other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, hypotheses[0].pair)]
-        if _is_bent(scene) and (start := competition.at_sides()) is not None:
-            other = self._grown_from(start, used)
-            if _sharpness(other, used) < _SHARPER * _sharpness(scene, used):
-                scene, hypotheses = other, [competition.of_grown(other, start.pair)]
+        if _is_bent(scene) and (side := competition.at_sides()) is not None:
+            other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
+            if other is not None:
+                scene, hypotheses = other, [competition.of_grown(other, side.pair)]
         return _Grown(scene, hypotheses, used)
 
     def _grown_from(self, start: Hypothesis, observations: Observations) -> GrowingScene:
@@ -345,6 +345,17 @@ class _Search:
         rivals = rivals_of(grown.hypotheses, grown.scene.world_T_cam)
         focal = grown.scene.mean_focal
         return self.holding_rivals(FocalInterval(focal, focal), rivals).reach(focal) <= OPEN_FOCAL
+
+
+def _if_sharper(
+    grow_other: Callable[[], GrowingScene], scene: GrowingScene, observations: Observations
+) -> GrowingScene | None:
+    """Return another scene if it can be solved and explains what is seen more sharply than this one."""
+    try:
+        other = grow_other()
+    except SolverError:  # That of another start is no reason to do without this one.
+        return None
+    return other if _sharpness(other, observations) < _SHARPER * _sharpness(scene, observations) else None
 
 
 def _sharpness(scene: GrowingScene, observations: Observations) -> float:
