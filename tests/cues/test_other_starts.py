@@ -7,8 +7,9 @@ import pytest
 from cues.start_scenes import GUESS, SIZE, K, TrackedScene, sideways, tracked
 
 from uni4d_fg.config.load import load_config
-from uni4d_fg.cues.structure.hypotheses import Competition, at_sides
-from uni4d_fg.cues.structure.motion import StartCameras, structure_from_motion
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, at_sides
+from uni4d_fg.cues.structure.motion import StartCameras, _Search, structure_from_motion
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, unproject, world_to_camera
 from uni4d_fg.progress import SilentReporter
@@ -115,3 +116,26 @@ def test_the_sides_are_a_quarter_of_the_width_each() -> None:
     seen = Observations(track, frame, uv, np.full(len(uv), np.nan), np.ones(len(uv)))
     expected = np.repeat([True, True, False, False, False, True, True], 2)
     np.testing.assert_array_equal(at_sides(seen, SIZE), expected)
+
+
+def test_where_cameras_that_were_found_before_explain_as_much_as_any_start_nothing_else_is_grown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = tracked(sideways(FRAMES), 2)
+    grown = []
+    grow = _Search._grown_from
+
+    def spy(search: _Search, start: Hypothesis, seen: Observations) -> GrowingScene:
+        grown.append(start)
+        return grow(search, start, seen)
+
+    monkeypatch.setattr(_Search, "_grown_from", spy)
+    path, turn, focal, _ = solved(scene)
+    assert len(grown) == 1
+    again, straight, same, _ = solved(scene, StartCameras(scene.world_T_cam, K))
+    assert len(grown) == 1
+    assert again == pytest.approx(path, rel=0.02)
+    assert straight == pytest.approx(turn, rel=0.02)
+    assert same == pytest.approx(focal, rel=0.001)
+    solved(scene, StartCameras(scene.world_T_cam[::-1].copy(), K))
+    assert len(grown) == 2

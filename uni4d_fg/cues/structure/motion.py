@@ -18,11 +18,11 @@ from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pai
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval, focal_is_open
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
-from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis
+from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, ranked
 from uni4d_fg.cues.structure.judging import errors_of
 from uni4d_fg.cues.structure.readout import at_one_time, find_readout, is_told_still
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
-from uni4d_fg.cues.structure.rivals import Rival, rivals_of
+from uni4d_fg.cues.structure.rivals import NEARLY_AS_WELL, Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.self_calibration import focal_of_pairs
 from uni4d_fg.cues.structure.triangulation import (
@@ -265,16 +265,35 @@ class _Search:
         self.reporter.end()
         if not hypotheses:
             return None
-        scene = self._grown_from(hypotheses[0], used.select(competition.chosen(hypotheses[0].tracks)))
-        if (start := self.start) is not None:
-            other = _if_sharper(lambda: self._continued(start, scene, used), scene, used)
-            if other is not None:
-                scene, hypotheses = other, [competition.of_grown(other, hypotheses[0].pair)]
+        scene, hypotheses = self._grown_best(competition, hypotheses, used)
         if _is_bent(scene) and (side := competition.at_sides()) is not None:
             other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
             if other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, side.pair)]
         return _Grown(scene, hypotheses, used)
+
+    def _grown_best(
+        self, competition: Competition, hypotheses: list[Hypothesis], used: Observations
+    ) -> tuple[GrowingScene, list[Hypothesis]]:
+        """Return the scene that the best start, or the cameras that may be right, lead to, and all starts, best first.
+
+        Where these cameras explain nearly as much as any other start, nothing else is grown: what differs by so little
+        are trials that end at the same scene.
+        """
+        best = hypotheses[0]
+        if self.start is None:
+            return self._grown_from(best, used.select(competition.chosen(best.tracks))), hypotheses
+        start = self.start
+        known = competition.of_grown(_at_cameras(best.scene, start), best.pair)
+        known, *others = sorted(ranked([known, *hypotheses]), key=lambda one: one.scene is not known.scene)
+        if known.cost <= others[0].cost + NEARLY_AS_WELL:
+            try:
+                return self._continued(best.scene, start, used), [known, *others]
+            except SolverError:  # That of another start is no reason to do without this one.
+                pass
+        scene = self._grown_from(best, used.select(competition.chosen(best.tracks)))
+        other = _if_sharper(lambda: self._continued(scene, start, used), scene, used)
+        return (scene, hypotheses) if other is None else (other, [competition.of_grown(other, best.pair)])
 
     def _grown_from(self, start: Hypothesis, observations: Observations) -> GrowingScene:
         """Grow a start over all frames, with tracks that may be others than those of its trial, and trim it."""
@@ -287,13 +306,9 @@ class _Search:
             trim(scene)
         return self._grown_to_the_end(scene)
 
-    def _continued(self, start: StartCameras, scene: GrowingScene, observations: Observations) -> GrowingScene:
-        """Return a scene that begins with cameras of all frames, with the settings of another one."""
-        cameras = replace(
-            scene, world_T_cam=start.world_T_cam, intrinsics=start.intrinsics,
-            registered=np.ones(self.num_frames, dtype=bool),
-        )  # fmt: skip
-        other = cameras.seeing(observations)
+    def _continued(self, scene: GrowingScene, start: StartCameras, observations: Observations) -> GrowingScene:
+        """Return a scene that begins with cameras of all frames, for the rest as another one."""
+        other = _at_cameras(scene, start).seeing(observations, self.config)
         trim(other)
         return self._grown_to_the_end(other)
 
@@ -345,6 +360,14 @@ class _Search:
         rivals = rivals_of(grown.hypotheses, grown.scene.world_T_cam)
         focal = grown.scene.mean_focal
         return self.holding_rivals(FocalInterval(focal, focal), rivals).reach(focal) <= OPEN_FOCAL
+
+
+def _at_cameras(scene: GrowingScene, start: StartCameras) -> GrowingScene:
+    """Return a scene with cameras of all frames."""
+    return replace(
+        scene, world_T_cam=start.world_T_cam, intrinsics=start.intrinsics,
+        registered=np.ones(len(start.world_T_cam), dtype=bool),
+    )  # fmt: skip
 
 
 def _if_sharper(

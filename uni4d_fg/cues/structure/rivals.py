@@ -12,7 +12,7 @@ from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.hypotheses import Hypothesis
 from uni4d_fg.errors import SolverError
 
-_NEARLY_AS_WELL = 0.02
+NEARLY_AS_WELL = 0.02
 """A rival leaves at most this much more unexplained."""
 _LEAST_COMMON = 4
 
@@ -48,7 +48,7 @@ def rivals_of(hypotheses: list[Hypothesis], world_T_cam: FloatArray) -> list[Riv
     found = []
     for hypothesis in hypotheses:
         frames = np.flatnonzero(hypothesis.scene.registered)
-        if hypothesis.misfit > hypotheses[0].misfit + _NEARLY_AS_WELL or len(frames) < _LEAST_COMMON:
+        if hypothesis.misfit > hypotheses[0].misfit + NEARLY_AS_WELL or len(frames) < _LEAST_COMMON:
             continue
         try:
             hypothesis.scene.measure_noise()
