@@ -22,34 +22,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, fit_zoom, part_of, probing, scene_of
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.lens_agreement import halves_agree
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
-from uni4d_fg.cues.structure.trimming import trim
-from uni4d_fg.errors import Cancelled, SolverError
-from uni4d_fg.factors.state import State
-from uni4d_fg.factors.variable_types import INTRINSICS, OPENCV_CAMERA, POSE, ZOOM
-from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
-from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.problem import Problem
-from uni4d_fg.optim.stage import Stage, run_stage
-from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.errors import SolverError
+from uni4d_fg.geometry.lens import LensModel
 from uni4d_fg.slam.lens.camera_model import CameraModel
-from uni4d_fg.slam.lens.problems import RealPixels, lens_problem, zoom_problem
 from uni4d_fg.slam.lens.sharpness import sharp_frames
 from uni4d_fg.slam.lens.strength import Strength, strength_of
-from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.observations import Observations
-from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames
 
 Grown = Callable[[Observations, FloatArray], GrowingScene | None]
 """Grows a scene from ideal observations, with intrinsics that are held."""
 
-_DAMPING = 1e-6
-"""Of the probe: the scale of a scene is held by a weak prior only, so that steps are not quite undamped."""
 _PROBED = 0.4
 """Part of a zoom that the steps of the probe find, at least."""
 _MIN_LENS_EVIDENCE = 0.003
@@ -70,22 +59,6 @@ _SETTLED = 0.003
 _FAR_APART = 0.1
 """Points nearer to each other than this part of the image's diagonal say little of a similarity."""
 _PAIRS = 4000
-_LOST = 50.0
-"""Errors, in sigmas, are cut here: what a camera does not explain counts as much."""
-_MAX_FRAMES = 120
-"""Frames that cameras are compared on, at most: a focal length per frame makes the system of the cameras dense."""
-_SIGHTINGS = 4
-"""In so many of them an average track is seen at least."""
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    """A camera that was fitted, and the poses that go with it."""
-
-    camera: CameraModel
-    scene: GrowingScene
-    evidence: float = 0.0
-    """Part of the reprojection energy that setting the camera free took away."""
 
 
 @dataclass(frozen=True)
@@ -126,22 +99,22 @@ def find_camera(
     part = part_of(scene, settings.observations, sharp)
     if not part.good.any():
         return None
-    plain = _Fitted(CameraModel(part.intrinsics), part)
+    plain = Fitted(CameraModel(part.intrinsics), part)
     starts = [proposed] if proposed is not None and proposed.zoom is not None else []
     if _asks_for_zoom(plain, config):
         log_ratio = similarities(scene.observations, len(scene.registered), image_size)
         starts.append(CameraModel(scene.prior_intrinsics, zoom=np.exp(log_ratio - log_ratio.max())))
     asks_for_lens = settings.model == "auto" and (
-        _joint(plain, "SIMPLE_RADIAL", config, _probing(config)).evidence >= _MIN_LENS_EVIDENCE
+        fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
     if not (starts or asks_for_lens):
         return None
-    judge = _Judge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
+    judge = TrackJudge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
     best, gain = plain, 0.0
     if asks_for_lens:
         lens = _find_lens(plain, judge, config)
         gain = judge.better(lens, plain)[0]
-        if is_lens(lens.camera, image_size, gain, config):
+        if is_lens(lens.camera, image_size, gain, config) and halves_agree(lens, image_size, config):
             best = lens
     for start in starts:
         zoom = _find_zoom(start, plain, judge, scene, real, config, grown)
@@ -150,72 +123,20 @@ def find_camera(
     return None if best is plain else FoundCamera(best.camera, gain)
 
 
-def part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> GrowingScene:
-    """Return the scene with evenly spread tracks that have about so many observations together, in some of (T,)."""
-    seen = scene.observations.select(frames[scene.observations.frame])
-    _, row = seen.rows()
-    count = np.bincount(row)
-    last = np.cumsum(count) - 1
-    spans = TrackSpans(seen.frame[last - count + 1], seen.frame[last], count)
-    chosen = np.zeros(len(scene.registered), dtype=bool)
-    chosen[calibration_frames(spans, len(chosen), _MAX_FRAMES, _SIGHTINGS)] = True
-    seen = seen.select(chosen[seen.frame]).with_min_observations(2)
-    return _scene_of(seen.select(seen.thinned(observations)), replace(scene, registered=scene.registered & chosen))
-
-
-def _scene_of(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
-    """Return what the cameras of a scene see of other observations, trimmed."""
-    scene = cameras.seeing(ideal)
-    trim(scene)
-    scene.measure_noise()
-    return scene
-
-
-@dataclass(frozen=True)
-class _Judge:
-    """Compares cameras by tracks that are triangulated anew."""
-
-    real: Observations
-    """As the images show them."""
-    sigma_px: float
-
-    def energies(self, fitted: _Fitted) -> FloatArray:
-        """Return the mean robust energy (K,) of each track on real pixels; NaN where its rays are too parallel."""
-        tracks, _ = self.real.rows()
-        scene = fitted.scene.seeing(fitted.camera.ideal_observations(self.real))
-        seen = scene.observations
-        size = fitted.camera.ideal_weight(seen.uv, seen.frame)
-        error = np.minimum(scene.errors() * np.sqrt(size) / self.sigma_px, _LOST)
-        row = np.searchsorted(tracks, seen.track)
-        count = np.bincount(row, minlength=len(tracks))
-        known = np.isin(tracks, seen.track[np.isfinite(scene.position[scene.row, 0])])
-        energy = np.bincount(row, np.log1p(error**2), len(tracks)) / np.maximum(count, 1)
-        return np.where(known, energy, np.nan)
-
-    def better(self, fitted: _Fitted, rival: _Fitted) -> tuple[float, float]:
-        """Return by which part a camera lowers the energy of the tracks that both have a point of, and of how many."""
-        ours, theirs = self.energies(fitted), self.energies(rival)
-        known = np.isfinite(ours) & np.isfinite(theirs)
-        if not known.any():
-            return 0.0, 0.0
-        ours, theirs = ours[known], theirs[known]
-        return 1.0 - float(ours.sum() / max(theirs.sum(), 1e-300)), float(np.mean(ours < theirs))
-
-
-def _asks_for_zoom(plain: _Fitted, config: Config) -> bool:
+def _asks_for_zoom(plain: Fitted, config: Config) -> bool:
     settings = config.camera
     if settings.zoom != "auto" or settings.model != "auto":
         return settings.zoom == "on"
     posed = np.flatnonzero(plain.scene.registered)
     if posed[-1] + int(np.diff(posed).max(initial=1)) < len(plain.scene.registered):
         return False  # Tracks are too short for so many frames, and nothing would be known of the rest.
-    probe = _free_zoom(plain, config, _probing(config))
+    probe = fit_zoom(plain, config, probing(config))
     assert probe.camera.zoom is not None
     moves = float(np.ptp(np.log(probe.camera.zoom))) >= _PROBED * settings.min_zoom
     return probe.evidence >= settings.min_zoom_evidence and moves
 
 
-def _is_zoom(zoom: _Fitted, plain: _Fitted, best: _Fitted, judge: _Judge, config: Config) -> bool:
+def _is_zoom(zoom: Fitted, plain: Fitted, best: Fitted, judge: TrackJudge, config: Config) -> bool:
     """Tell whether the focal length changes enough, for most tracks, and explains all together better than the best."""
     settings, ratio = config.camera, zoom.camera.zoom
     if ratio is None or ratio.max() / ratio.min() - 1.0 < settings.min_zoom:
@@ -237,7 +158,7 @@ def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, confi
     return gain >= config.camera.min_evidence_unsure if strength is Strength.WEAK else gain > 0.0
 
 
-def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
+def _find_lens(plain: Fitted, judge: TrackJudge, config: Config) -> Fitted:
     """Fit a radial lens, and from there once more with near and far exchanged."""
     found = _with_lens(plain, plain, judge, config)
     other = exchanged_and_refined(found.scene)
@@ -251,7 +172,7 @@ def _find_lens(plain: _Fitted, judge: _Judge, config: Config) -> _Fitted:
     return mirrored if judge.better(mirrored, found)[0] > 0.0 else found
 
 
-def _with_lens(found: _Fitted, rival: _Fitted, judge: _Judge, config: Config) -> _Fitted:
+def _with_lens(found: Fitted, rival: Fitted, judge: TrackJudge, config: Config) -> Fitted:
     """Fit one radial parameter, and a second one where there is one already or it takes energy away.
 
     Which tracks agree, and where they are triangulated, depends on the lens: it is fitted again until it stays, or
@@ -260,48 +181,27 @@ def _with_lens(found: _Fitted, rival: _Fitted, judge: _Judge, config: Config) ->
     settings = config.camera
     to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
 
-    def judged_anew(fitted: _Fitted) -> _Fitted:
-        return replace(fitted, scene=_scene_of(fitted.camera.ideal_observations(judge.real), fitted.scene))
+    def judged_anew(fitted: Fitted) -> Fitted:
+        return replace(fitted, scene=scene_of(fitted.camera.ideal_observations(judge.real), fitted.scene))
 
     first: LensModel = "RADIAL" if found.camera.lens.model == "RADIAL" else "SIMPLE_RADIAL"
     for _ in range(_LENS_ROUNDS):
         before = found.camera.lens.padded[0]
-        found = judged_anew(_joint(found, first, config, to_the_end))
+        found = judged_anew(fit_lens(found, first, config, to_the_end))
         if judge.better(found, rival)[0] < -_HOPELESS:
             return found
         if abs(found.camera.lens.padded[0] - before) < _LENS_STAYS:
             break
     if first == "RADIAL":
         return found
-    richer = _joint(found, "RADIAL", config, to_the_end)
+    richer = fit_lens(found, "RADIAL", config, to_the_end)
     return found if richer.evidence < _MIN_SECOND_EVIDENCE else judged_anew(richer)
 
 
-def _joint(start: _Fitted, model: LensModel, config: Config, options: dict[str, float]) -> _Fitted:
-    """Free the intrinsics, and then the parameters of a lens as well; the evidence is what the second takes away."""
-    bundle = _Bundle.of(start.scene)
-    camera = np.concatenate([start.scene.intrinsics, start.camera.lens.padded])
-    problem, state = lens_problem(
-        bundle.state, bundle.stage.problem.batches, bundle.pixels(start.camera, config), camera, model,
-        start.scene.prior_intrinsics, config.bundle_adjustment, config.camera,
-    )  # fmt: skip
-    pixel = [] if config.bundle_adjustment.free_principal_point else [2, 3]
-    solver = bundle.stage.solver.model_copy(update=options)
-    unused = range(4 + len(PARAMETERS[model]), 8)
-    known = range(4 if model == "SIMPLE_RADIAL" else 5, 8)
-    stop = start.scene.should_stop
-    state, before = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *known]), state, solver, stop)
-    state, after = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *unused]), state, solver, stop)
-    found = state[OPENCV_CAMERA][0]
-    evidence = (before.final_energy - after.final_energy) / max(before.final_energies["static_reprojection"], 1e-300)
-    scene = bundle.moved(start.scene, state, found[:4])
-    return _Fitted(CameraModel(scene.intrinsics, Lens.of(model, found[4:])), scene, evidence)
-
-
 def _find_zoom(
-    camera: CameraModel, plain: _Fitted, judge: _Judge, scene: GrowingScene, real: Observations, config: Config,
+    camera: CameraModel, plain: Fitted, judge: TrackJudge, scene: GrowingScene, real: Observations, config: Config,
     grown: Grown,
-) -> _Fitted | None:  # fmt: skip
+) -> Fitted | None:  # fmt: skip
     """Grow scenes from tracks whose zoom is undone, at first that of a camera to start from, and free what is left.
 
     None if no scene grows, or if after a round most tracks fit the camera that does not zoom better: of a zoom that is
@@ -316,7 +216,7 @@ def _find_zoom(
             return found
         part = part_of(start, settings.observations, plain.scene.registered)
         part.free_focal = scene.free_focal
-        found = _free_zoom(_Fitted(camera, part), config, to_the_end)
+        found = fit_zoom(Fitted(camera, part), config, to_the_end)
         assert camera.zoom is not None
         assert found.camera.zoom is not None
         if settings.zoom == "auto" and judge.better(found, plain)[1] < 0.5:
@@ -346,69 +246,3 @@ def similarities(observations: Observations, num_frames: int, image_size: tuple[
                 step = float(np.median(np.log(np.maximum(later[known], 1e-9) / apart[known])))
         out[frame] = out[frame - 1] + step
     return out
-
-
-def _free_zoom(start: _Fitted, config: Config, options: dict[str, float]) -> _Fitted:
-    """Free a focal length per frame, beside that which was undone."""
-    bundle = _Bundle.of(start.scene)
-    ideal = bundle.pixels(CameraModel(start.scene.intrinsics), config)
-    problem, state = zoom_problem(
-        bundle.state, bundle.stage.problem.batches, ideal, bundle.frames, config.bundle_adjustment, config.camera
-    )
-    before = problem.energies(state)["static_reprojection"]
-    solver = bundle.stage.solver.model_copy(update=options)
-    state, after = _solve(problem, state, solver, start.scene.should_stop)
-    every = np.arange(len(start.scene.registered))
-    zoom = np.interp(every, bundle.frames, state[ZOOM][:, 0])
-    zoom = zoom if start.camera.zoom is None else zoom + np.log(start.camera.zoom)
-    intrinsics = state[INTRINSICS][0].copy()
-    longest = float(zoom.max())
-    intrinsics[:2] *= np.exp(longest)
-    evidence = (after.initial_energy - after.final_energy) / max(before, 1e-300)
-    scene = bundle.moved(start.scene, state, intrinsics)
-    return _Fitted(CameraModel(intrinsics, zoom=np.exp(zoom - longest)), scene, evidence)
-
-
-@dataclass(frozen=True)
-class _Bundle:
-    """Bundle adjustment of a scene, and what is seen in it."""
-
-    stage: Stage
-    state: State
-    frames: IntArray
-    """(F,) that have a pose."""
-    used: Observations
-    """Those that take part, at ideal pixels."""
-    sigma_px: float
-
-    @classmethod
-    def of(cls, scene: GrowingScene) -> _Bundle:
-        stage, state, frames, _ = scene.bundle()
-        return cls(stage, state, frames, scene.used()[0], scene.noise_px)
-
-    def pixels(self, camera: CameraModel, config: Config) -> RealPixels:
-        """Return the observations as a camera has them whose ideal pixels they are at."""
-        used, frame = self.used, np.searchsorted(self.frames, self.used.frame)
-        weight = used.weight / camera.ideal_weight(used.uv, used.frame)
-        kernel = config.bundle_adjustment.reprojection_kernel
-        noise = MAP.observed(self.sigma_px, weight, kernel, frame, len(self.frames))
-        return RealPixels(frame, used.rows()[1], camera.real(used.uv, used.frame), noise)
-
-    def moved(self, scene: GrowingScene, state: State, intrinsics: FloatArray) -> GrowingScene:
-        """Return a scene with the cameras of a state; its points are those of before."""
-        poses = scene.world_T_cam.copy()
-        poses[self.frames] = state[POSE]
-        return replace(scene, world_T_cam=poses, intrinsics=intrinsics.copy())
-
-
-def _probing(config: Config) -> dict[str, float]:
-    return {"max_iterations": config.camera.probe_steps, "initial_damping": _DAMPING, "relative_decrease": 0.0}
-
-
-def _solve(
-    problem: Problem, state: State, solver: SolverConfig, should_stop: Callable[[], bool]
-) -> tuple[State, SolveSummary]:
-    state, summary = run_stage(Stage("camera", problem, solver), state, Hooks(should_stop=should_stop))
-    if summary.termination is Termination.CANCELLED:
-        raise Cancelled("structure from motion stopped")
-    return state, summary

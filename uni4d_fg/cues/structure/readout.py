@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
-from uni4d_fg.cues.structure.camera_search import part_of
+from uni4d_fg.cues.structure.camera_fit import part_of
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.slam.lens.readout_search import BELIEVED, FIRST, least_readout
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout

@@ -1,0 +1,79 @@
+"""A lens is the same in all parts of a video."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cues.start_scenes import GUESS, SIZE, K, TrackedScene, sideways, tracked
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure import camera_search
+from uni4d_fg.cues.structure.lens_agreement import bend, halves
+from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.geometry.lens import Lens
+from uni4d_fg.progress import SilentReporter
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.stages.observations import Observations
+
+FRAMES = 20
+LENS = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.12,)))
+
+
+def through(scene: TrackedScene, below: float) -> TrackedScene:
+    """Bend the tracks that begin below a height, as a part of the picture's, by the lens."""
+    seen = scene.observations
+    _, row = seen.rows()
+    _, first = np.unique(row, return_index=True)
+    is_below = (seen.uv[first, 1] > below * SIZE[0])[row]
+    bent = LENS.real(seen.uv, seen.frame)
+    uv = np.where(is_below[:, None], bent, seen.uv)
+    return replace(scene, observations=replace(seen, uv=uv))
+
+
+def solved(scene: TrackedScene) -> Structure:
+    found = structure_from_motion(
+        scene.observations, FRAMES, SIZE, GUESS, load_config("default", []), SilentReporter(), lambda: False,
+        any_camera=True,
+    )  # fmt: skip
+    assert found is not None
+    return found
+
+
+def test_what_bends_one_half_of_the_picture_is_no_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = through(tracked(sideways(FRAMES), points=1500), below=0.5)
+    found = solved(scene)
+    assert found.camera.lens.is_pinhole
+    monkeypatch.setattr(camera_search, "halves_agree", lambda *_: True)
+    believed = solved(scene)
+    assert not believed.camera.lens.is_pinhole
+    assert -0.12 < believed.camera.lens.parameters[0] < -0.02
+
+
+def test_what_bends_all_of_it_is_one() -> None:
+    scene = through(tracked(sideways(FRAMES), points=1500), below=0.0)
+    found = solved(scene)
+    assert found.camera.lens.parameters[0] == pytest.approx(-0.12, abs=0.02)
+    extent = np.linalg.norm(np.ptp(scene.world_T_cam[:, :3, 3], axis=0))
+    assert evaluate_trajectory(found.world_T_cam, scene.world_T_cam).ate_m / extent < 0.004
+
+
+def test_bend_is_that_of_pixels_at_half_the_shorter_side() -> None:
+    radius = 0.5 * min(SIZE) / K[0]
+    assert bend(LENS, SIZE) == pytest.approx(-0.12 * radius**2, rel=1e-9)
+    assert bend(CameraModel(K), SIZE) == 0.0
+
+
+def test_halves_are_of_time_and_place() -> None:
+    # Four tracks of four frames, one per corner of the picture.
+    track, frame = np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4)
+    uv = np.array([[10.0, 10.0], [90.0, 10.0], [10.0, 70.0], [90.0, 70.0]])[track]
+    early, late, left, right, upper, lower = halves(Observations(track, frame, uv, np.full(16, np.nan), np.ones(16)))
+    np.testing.assert_array_equal(early, frame < 2)
+    np.testing.assert_array_equal(late, frame >= 2)
+    np.testing.assert_array_equal(left, np.isin(track, [0, 2]))
+    np.testing.assert_array_equal(right, np.isin(track, [1, 3]))
+    np.testing.assert_array_equal(upper, track < 2)
+    np.testing.assert_array_equal(lower, track >= 2)

@@ -1,0 +1,186 @@
+"""Cameras fitted to the tracks of a grown scene: with a lens, with a focal length per frame, and which fits better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.config.models import Config
+from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.errors import Cancelled
+from uni4d_fg.factors.state import State
+from uni4d_fg.factors.variable_types import INTRINSICS, OPENCV_CAMERA, POSE, ZOOM
+from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
+from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.summary import SolveSummary, Termination
+from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.problems import RealPixels, lens_problem, zoom_problem
+from uni4d_fg.slam.stages.energy import MAP
+from uni4d_fg.slam.stages.observations import Observations
+from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames
+
+_DAMPING = 1e-6
+"""Of the probe: the scale of a scene is held by a weak prior only, so that steps are not quite undamped."""
+_LOST = 50.0
+"""Errors, in sigmas, are cut here: what a camera does not explain counts as much."""
+_MAX_FRAMES = 120
+"""Frames that cameras are compared on, at most: a focal length per frame makes the system of the cameras dense."""
+_SIGHTINGS = 4
+"""In so many of them an average track is seen at least."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A camera that was fitted, and the poses that go with it."""
+
+    camera: CameraModel
+    scene: GrowingScene
+    evidence: float = 0.0
+    """Part of the reprojection energy that setting the camera free took away."""
+
+
+def part_of(scene: GrowingScene, observations: int, frames: BoolArray) -> GrowingScene:
+    """Return the scene with evenly spread tracks that have about so many observations together, in some of (T,)."""
+    seen = scene.observations.select(frames[scene.observations.frame])
+    _, row = seen.rows()
+    count = np.bincount(row)
+    last = np.cumsum(count) - 1
+    spans = TrackSpans(seen.frame[last - count + 1], seen.frame[last], count)
+    chosen = np.zeros(len(scene.registered), dtype=bool)
+    chosen[calibration_frames(spans, len(chosen), _MAX_FRAMES, _SIGHTINGS)] = True
+    seen = seen.select(chosen[seen.frame]).with_min_observations(2)
+    return scene_of(seen.select(seen.thinned(observations)), replace(scene, registered=scene.registered & chosen))
+
+
+def scene_of(ideal: Observations, cameras: GrowingScene) -> GrowingScene:
+    """Return what the cameras of a scene see of other observations, trimmed."""
+    scene = cameras.seeing(ideal)
+    trim(scene)
+    scene.measure_noise()
+    return scene
+
+
+@dataclass(frozen=True)
+class TrackJudge:
+    """Compares cameras by tracks that are triangulated anew."""
+
+    real: Observations
+    """As the images show them."""
+    sigma_px: float
+
+    def energies(self, fitted: Fitted) -> FloatArray:
+        """Return the mean robust energy (K,) of each track on real pixels; NaN where its rays are too parallel."""
+        tracks, _ = self.real.rows()
+        scene = fitted.scene.seeing(fitted.camera.ideal_observations(self.real))
+        seen = scene.observations
+        size = fitted.camera.ideal_weight(seen.uv, seen.frame)
+        error = np.minimum(scene.errors() * np.sqrt(size) / self.sigma_px, _LOST)
+        row = np.searchsorted(tracks, seen.track)
+        count = np.bincount(row, minlength=len(tracks))
+        known = np.isin(tracks, seen.track[np.isfinite(scene.position[scene.row, 0])])
+        energy = np.bincount(row, np.log1p(error**2), len(tracks)) / np.maximum(count, 1)
+        return np.where(known, energy, np.nan)
+
+    def better(self, fitted: Fitted, rival: Fitted) -> tuple[float, float]:
+        """Return by which part a camera lowers the energy of the tracks that both have a point of, and of how many."""
+        ours, theirs = self.energies(fitted), self.energies(rival)
+        known = np.isfinite(ours) & np.isfinite(theirs)
+        if not known.any():
+            return 0.0, 0.0
+        ours, theirs = ours[known], theirs[known]
+        return 1.0 - float(ours.sum() / max(theirs.sum(), 1e-300)), float(np.mean(ours < theirs))
+
+
+def fit_lens(start: Fitted, model: LensModel, config: Config, options: dict[str, float]) -> Fitted:
+    """Free the intrinsics, and then the parameters of a lens as well; the evidence is what the second takes away."""
+    bundle = _Bundle.of(start.scene)
+    camera = np.concatenate([start.scene.intrinsics, start.camera.lens.padded])
+    problem, state = lens_problem(
+        bundle.state, bundle.stage.problem.batches, bundle.pixels(start.camera, config), camera, model,
+        start.scene.prior_intrinsics, config.bundle_adjustment, config.camera,
+    )  # fmt: skip
+    pixel = [] if config.bundle_adjustment.free_principal_point else [2, 3]
+    solver = bundle.stage.solver.model_copy(update=options)
+    unused = range(4 + len(PARAMETERS[model]), 8)
+    known = range(4 if model == "SIMPLE_RADIAL" else 5, 8)
+    stop = start.scene.should_stop
+    state, before = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *known]), state, solver, stop)
+    state, after = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *unused]), state, solver, stop)
+    found = state[OPENCV_CAMERA][0]
+    evidence = (before.final_energy - after.final_energy) / max(before.final_energies["static_reprojection"], 1e-300)
+    scene = bundle.moved(start.scene, state, found[:4])
+    return Fitted(CameraModel(scene.intrinsics, Lens.of(model, found[4:])), scene, evidence)
+
+
+def fit_zoom(start: Fitted, config: Config, options: dict[str, float]) -> Fitted:
+    """Free a focal length per frame, beside that which was undone."""
+    bundle = _Bundle.of(start.scene)
+    ideal = bundle.pixels(CameraModel(start.scene.intrinsics), config)
+    problem, state = zoom_problem(
+        bundle.state, bundle.stage.problem.batches, ideal, bundle.frames, config.bundle_adjustment, config.camera
+    )
+    before = problem.energies(state)["static_reprojection"]
+    solver = bundle.stage.solver.model_copy(update=options)
+    state, after = _solve(problem, state, solver, start.scene.should_stop)
+    every = np.arange(len(start.scene.registered))
+    zoom = np.interp(every, bundle.frames, state[ZOOM][:, 0])
+    zoom = zoom if start.camera.zoom is None else zoom + np.log(start.camera.zoom)
+    intrinsics = state[INTRINSICS][0].copy()
+    longest = float(zoom.max())
+    intrinsics[:2] *= np.exp(longest)
+    evidence = (after.initial_energy - after.final_energy) / max(before, 1e-300)
+    scene = bundle.moved(start.scene, state, intrinsics)
+    return Fitted(CameraModel(intrinsics, zoom=np.exp(zoom - longest)), scene, evidence)
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """Bundle adjustment of a scene, and what is seen in it."""
+
+    stage: Stage
+    state: State
+    frames: IntArray
+    """(F,) that have a pose."""
+    used: Observations
+    """Those that take part, at ideal pixels."""
+    sigma_px: float
+
+    @classmethod
+    def of(cls, scene: GrowingScene) -> _Bundle:
+        stage, state, frames, _ = scene.bundle()
+        return cls(stage, state, frames, scene.used()[0], scene.noise_px)
+
+    def pixels(self, camera: CameraModel, config: Config) -> RealPixels:
+        """Return the observations as a camera has them whose ideal pixels they are at."""
+        used, frame = self.used, np.searchsorted(self.frames, self.used.frame)
+        weight = used.weight / camera.ideal_weight(used.uv, used.frame)
+        kernel = config.bundle_adjustment.reprojection_kernel
+        noise = MAP.observed(self.sigma_px, weight, kernel, frame, len(self.frames))
+        return RealPixels(frame, used.rows()[1], camera.real(used.uv, used.frame), noise)
+
+    def moved(self, scene: GrowingScene, state: State, intrinsics: FloatArray) -> GrowingScene:
+        """Return a scene with the cameras of a state; its points are those of before."""
+        poses = scene.world_T_cam.copy()
+        poses[self.frames] = state[POSE]
+        return replace(scene, world_T_cam=poses, intrinsics=intrinsics.copy())
+
+
+def probing(config: Config) -> dict[str, float]:
+    """Return the options of a few steps with little damping that leave a minimum which is none of the right camera."""
+    return {"max_iterations": config.camera.probe_steps, "initial_damping": _DAMPING, "relative_decrease": 0.0}
+
+
+def _solve(
+    problem: Problem, state: State, solver: SolverConfig, should_stop: Callable[[], bool]
+) -> tuple[State, SolveSummary]:
+    state, summary = run_stage(Stage("camera", problem, solver), state, Hooks(should_stop=should_stop))
+    if summary.termination is Termination.CANCELLED:
+        raise Cancelled("structure from motion stopped")
+    return state, summary
