@@ -21,7 +21,7 @@ from uni4d_fg.slam.stages.observations import Observations
 
 _OPTIONS = {"relative_decrease": 1e-5, "max_iterations": 50}
 _DISAGREE = 1.0 / 3.0
-"""Root mean square of how far halves bend the image more or less than all tracks do, as a part of that: 0.02 to 0.25
+"""Root mean square of how far halves bend the image more or less than all tracks do, as a part of that: 0.01 to 0.25
 for lenses of rendered clips, 0.23 to 0.29 for a k1 of -0.06 on recordings; 0.37 to 3 where there is none."""
 
 
