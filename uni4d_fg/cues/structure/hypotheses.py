@@ -14,7 +14,7 @@ from uni4d_fg.cues.structure.first_pair import FramePair, rank_pairs
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.judging import HeldOut, held_out
-from uni4d_fg.cues.structure.selection import spread_tracks
+from uni4d_fg.cues.structure.selection import mean_pixels, spread_tracks
 from uni4d_fg.cues.structure.self_calibration import FocalGuess
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.progress import SilentReporter
@@ -233,9 +233,8 @@ def ranked(found: list[Hypothesis]) -> list[Hypothesis]:
 
 def at_sides(observations: Observations, image_size: tuple[int, int]) -> BoolArray:
     """Return (N,) which observations are of tracks that are seen at the left or right of the picture, in the mean."""
-    tracks, row = observations.rows()
-    x = np.bincount(row, observations.uv[:, 0], len(tracks)) / np.bincount(row, minlength=len(tracks))
-    width = image_size[1]
+    pixels, row = mean_pixels(observations)
+    x, width = pixels[:, 0], image_size[1]
     beside = (x < _SIDE * width) | (x > (1.0 - _SIDE) * width)
     return np.asarray(beside[row])
 

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.camera_fit import Fitted, fit_lens, scene_of
+from uni4d_fg.cues.structure.selection import mean_pixels
 from uni4d_fg.errors import SolverError
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
@@ -62,11 +63,9 @@ def halves(observations: Observations) -> list[BoolArray]:
 
     Tracks are divided by their mean positions, so that they are whole; frames by how much is seen in them.
     """
-    tracks, row = observations.rows()
-    count = np.maximum(np.bincount(row, minlength=len(tracks)), 1)
+    pixels, row = mean_pixels(observations)
     late = observations.frame > np.median(observations.frame)
-    sides: list[FloatArray] = [np.bincount(row, observations.uv[:, axis], len(tracks)) / count for axis in (0, 1)]
-    right, lower = ((mean >= np.median(mean))[row] for mean in sides)
+    right, lower = (pixels >= np.median(pixels, axis=0))[row].T
     return [part for one in (late, right, lower) for part in (~one, one)]
 
 

@@ -287,10 +287,9 @@ class _Search:
         known = competition.of_grown(_at_cameras(best.scene, start), best.pair)
         known, *others = sorted(ranked([known, *hypotheses]), key=lambda one: one.scene is not known.scene)
         if known.cost <= others[0].cost + NEARLY_AS_WELL:
-            try:
-                return self._continued(best.scene, start, used), [known, *others]
-            except SolverError:  # That of another start is no reason to do without this one.
-                pass
+            continued = _if_solved(lambda: self._continued(best.scene, start, used))
+            if continued is not None:
+                return continued, [known, *others]
         scene = self._grown_from(best, used.select(competition.chosen(best.tracks)))
         other = _if_sharper(lambda: self._continued(scene, start, used), scene, used)
         return (scene, hypotheses) if other is None else (other, [competition.of_grown(other, best.pair)])
@@ -370,13 +369,20 @@ def _at_cameras(scene: GrowingScene, start: StartCameras) -> GrowingScene:
     )  # fmt: skip
 
 
+def _if_solved(grow_other: Callable[[], GrowingScene]) -> GrowingScene | None:
+    """Return another scene, or None where it cannot be solved: that is no reason to do without the other starts."""
+    try:
+        return grow_other()
+    except SolverError:
+        return None
+
+
 def _if_sharper(
     grow_other: Callable[[], GrowingScene], scene: GrowingScene, observations: Observations
 ) -> GrowingScene | None:
     """Return another scene if it can be solved and explains what is seen more sharply than this one."""
-    try:
-        other = grow_other()
-    except SolverError:  # That of another start is no reason to do without this one.
+    other = _if_solved(grow_other)
+    if other is None:
         return None
     return other if _sharpness(other, observations) < _SHARPER * _sharpness(scene, observations) else None
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, sum_rows
 from uni4d_fg.slam.stages.observations import Observations
 
 _COLUMNS, _ROWS = 12, 9
@@ -92,3 +92,10 @@ def picture_cells(uv: FloatArray, image_size: tuple[int, int]) -> IntArray:
     line = np.clip(uv[:, 1] * _ROWS / height, 0, _ROWS - 1).astype(np.int64)
     result: IntArray = line * _COLUMNS + column
     return result
+
+
+def mean_pixels(observations: Observations) -> tuple[FloatArray, IntArray]:
+    """Return where each track is seen in the mean, (K, 2) px, and the row of each observation's track, (N,)."""
+    tracks, row = observations.rows()
+    count = np.bincount(row, minlength=len(tracks))
+    return sum_rows(observations.uv, row, len(tracks)) / count[:, None], row
