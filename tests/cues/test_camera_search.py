@@ -174,7 +174,7 @@ def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
 
 def test_frames_that_are_blurred_do_not_tell_a_lens(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is found in them errs outward, as through a lens; told that they are blurred, the search leaves them out."""
-    monkeypatch.setattr(camera_search, "halves_agree", lambda *_: True)  # half of the tracks would tell as well
+    monkeypatch.setattr(camera_search, "halves_agree_on_lens", lambda *_: True)  # half of the tracks would tell as well
     scene = tracked(sideways(FRAMES), noise_px=0.1)
     seen, blurred = scene.observations, np.arange(FRAMES) % 5 > 2
     bent = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.04,))).real(seen.uv, seen.frame)

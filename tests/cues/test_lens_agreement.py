@@ -46,7 +46,7 @@ def test_what_bends_one_half_of_the_picture_is_no_lens(monkeypatch: pytest.Monke
     scene = through(tracked(sideways(FRAMES), points=1500), below=0.5)
     found = solved(scene)
     assert found.camera.lens.is_pinhole
-    monkeypatch.setattr(camera_search, "halves_agree", lambda *_: True)
+    monkeypatch.setattr(camera_search, "halves_agree_on_lens", lambda *_: True)
     believed = solved(scene)
     assert not believed.camera.lens.is_pinhole
     assert -0.12 < believed.camera.lens.parameters[0] < -0.02
@@ -77,3 +77,33 @@ def test_halves_are_of_time_and_place() -> None:
     np.testing.assert_array_equal(right, np.isin(track, [1, 3]))
     np.testing.assert_array_equal(upper, track < 2)
     np.testing.assert_array_equal(lower, track >= 2)
+
+
+ZOOM = CameraModel(K, zoom=1.3 ** np.linspace(-1.0, 0.0, FRAMES))
+
+
+def zoomed(scene: TrackedScene, part: float) -> TrackedScene:
+    """Zoom in on the tracks that begin left of a place, as a part of the picture's width."""
+    seen = scene.observations
+    _, row = seen.rows()
+    _, first = np.unique(row, return_index=True)
+    is_left = (seen.uv[first, 0] < part * SIZE[1])[row]
+    uv = np.where(is_left[:, None], ZOOM.real(seen.uv, seen.frame), seen.uv)
+    return replace(scene, observations=replace(seen, uv=uv))
+
+
+def test_what_grows_in_one_half_of_the_picture_is_no_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = zoomed(tracked(sideways(FRAMES), points=1500), part=0.7)
+    found = solved(scene)
+    assert found.camera.zoom is None
+    monkeypatch.setattr(camera_search, "halves_agree_on_zoom", lambda *_: True)
+    believed = solved(scene)
+    assert believed.camera.zoom is not None
+    assert np.ptp(np.log(believed.camera.zoom)) > 0.1
+
+
+def test_what_grows_in_all_of_it_is_one() -> None:
+    scene = zoomed(tracked(sideways(FRAMES), points=1500), part=1.1)
+    found = solved(scene)
+    assert found.camera.zoom is not None
+    np.testing.assert_allclose(found.intrinsics[0] * found.camera.zoom, K[0] * ZOOM.zoom, rtol=0.03)

@@ -135,6 +135,12 @@ class MotionMaskConfig(Section):
     track_reach_px: float = setting(
         4.0, "How far a track's evidence reaches over the pixels around it, working px.", gt=0
     )
+    behind_reach_px: int = setting(
+        4,
+        "Depth that was interpolated is taken from the scene around up to this far beyond where most tracks move, "
+        "working px.",
+        ge=0,
+    )
     track_undecided: float = setting(
         0.6,
         "Undecided tracks that are added at every pixel, as a part of those that are usually around one: with more "

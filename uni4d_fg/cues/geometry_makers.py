@@ -151,7 +151,7 @@ def moving_masks(
         return open_labels(target, video.num_frames, video.image_size), facts, warnings
     result = motion_masks(
         video, depths, tracks, camera.intrinsics, config.motion_masks, reporter, should_stop, config, moving, camera,
-        world_T_cam,
+        world_T_cam, isinstance(depths, GridDepths),
     )  # fmt: skip
     cache.put_arrays("said", said=np.array(json.dumps([result.facts, result.warnings])))
     masks = store_labels(iter(result.labels), video.num_frames, video.image_size, target, "masks to disk", reporter)

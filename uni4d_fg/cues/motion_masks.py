@@ -5,7 +5,8 @@
    motion, they are solved before, robustly, and once more without what was found, and the tracks tested again.
 2. Every frame is compared with others before and after it as a static scene would look there
    (:mod:`uni4d_fg.cues.appearance`). Of the two directions the less suspicious one counts: what is hidden in one is
-   mostly seen in the other.
+   mostly seen in the other. Depth that is interpolated between points is that of the scene around, where most tracks
+   move (:mod:`uni4d_fg.cues.behind_moving`).
 3. The evidence of pixels and tracks, and of the frames next to it, is smoothed within surfaces of like color; regions
    above a threshold are kept unless their own tracks say that they are static (:mod:`uni4d_fg.cues.moving_regions`).
    They end where colors do (:mod:`uni4d_fg.cues.region_colors`).
@@ -28,12 +29,13 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.counted import counted
 from uni4d_fg.cues.appearance import FrameAppearance, frame_appearance, moved_evidence
+from uni4d_fg.cues.behind_moving import depth_behind
 from uni4d_fg.cues.dense_flow import DenseFlow, shrink, shrunk_size, warp_back, working_scale
 from uni4d_fg.cues.depth_range import spread_at_tracks
 from uni4d_fg.cues.detections import FrameDetections
 from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.label_store import CompressedLabels
-from uni4d_fg.cues.moving_regions import grown, moving_region, track_evidence, trusted_components
+from uni4d_fg.cues.moving_regions import disk, grown, moving_region, track_evidence, trusted_components
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.region_colors import end_at_colors
@@ -79,6 +81,7 @@ def motion_masks(
     known_moving: BoolArray | None = None,
     camera: CameraModel | None = None,
     world_T_cam: FloatArray | None = None,
+    is_interpolated: bool = False,
 ) -> MotionMasks:
     """Find what moves in a video by comparing it with a static scene.
 
@@ -95,6 +98,7 @@ def motion_masks(
             alone (:mod:`uni4d_fg.cues.structure`), as a thing that moves by little stays within the sigmas of depth.
         camera: A lens or a zoom that is known, with its intrinsics, which are held; None for a pinhole.
         world_T_cam: (T, 4, 4) poses that are known, in the unit of the depth; None solves them from depth and tracks.
+        is_interpolated: Depth is that of points of the static scene, and knows nothing of what moves.
 
     Raises:
         InputError: If depth or tracks do not fit the images, or depth is missing wherever there is a track.
@@ -117,7 +121,7 @@ def motion_masks(
     )
     report.end()
     report.begin("motion masks", video.num_frames)
-    comparison = _Comparison(video, depths, tracks, cameras, camera, motion, config)
+    comparison = _Comparison(video, depths, tracks, cameras, camera, motion, config, is_interpolated)
     labels = CompressedLabels(video.image_size)
     seen_in: dict[int, int] = {}
     found = made_ahead(comparison.detections(stop), thread_count())
@@ -230,15 +234,17 @@ class _Comparison:
         camera: CameraModel,
         motion: TrackMotion,
         config: MotionMaskConfig,
+        is_interpolated: bool,
     ) -> None:
         self.video, self.depths, self.tracks = video, depths, tracks
-        self.cameras, self.motion, self.config = cameras, motion, config
+        self.cameras, self.motion, self.config, self.is_interpolated = cameras, motion, config, is_interpolated
         self.size = shrunk_size(video.image_size, working_scale(video.image_size, config.working_size_px))
         self.scale = np.array([self.size[1] / video.image_size[1], self.size[0] / video.image_size[0]])
         self.pixels = PixelGrid.of(replace(camera, intrinsics=cameras.intrinsics), self.size, video.image_size)
         self.grid = QuadraticGrid.of(self.size, self.scale, video.image_size)
         self.images: dict[int, ImageArray] = {}
         self.frames: dict[int, FrameAppearance] = {}
+        self.said: dict[int, Float32Array] = {}
         self.flow = DenseFlow(fine=False)
 
     def detections(self, stop: Callable[[], bool]) -> Generator[FrameDetections, None, None]:
@@ -268,13 +274,17 @@ class _Comparison:
             height, width = self.size
             image = shrink(self.video.images[frame], self.size)
             depth = cv2.resize(self.depths[frame], (width, height), interpolation=cv2.INTER_NEAREST)
+            self.said[frame] = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
+            if self.is_interpolated:
+                moving = cv2.dilate((self.said[frame] > 0).astype(np.uint8), disk(self.config.behind_reach_px))
+                depth = depth_behind(depth, moving > 0)
             edge = max(1, round(self.config.depth_edge_px * float(self.scale.mean())))
             self.images[frame] = image
             self.frames[frame] = frame_appearance(image, depth, float(self.cameras.log_scale[frame]), edge, self.config)
         return self.frames[frame]
 
     def _forget_before(self, frame: int) -> None:
-        for kept in (self.frames, self.images):
+        for kept in (self.frames, self.images, self.said):
             for old in [f for f in kept if f < frame]:
                 del kept[old]
 
@@ -300,8 +310,8 @@ class _Comparison:
                 count += 1
         if count:
             total *= len(self.config.baselines) / count
-        tracks = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
-        return total + np.float32(self.config.track_weight) * tracks
+        self._frame(frame)
+        return total + np.float32(self.config.track_weight) * self.said[frame]
 
     def _pair(self, pair: tuple[int, int]) -> Float32Array:
         source, target = pair

@@ -27,7 +27,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, fit_zoom, part_of, probing, scene_of
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.lens_agreement import halves_agree
+from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens, halves_agree_on_zoom
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
 from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry.lens import LensModel
@@ -114,7 +114,7 @@ def find_camera(
     if asks_for_lens:
         lens = _find_lens(plain, judge, config)
         gain = judge.better(lens, plain)[0]
-        if is_lens(lens.camera, image_size, gain, config) and halves_agree(lens, image_size, config):
+        if is_lens(lens.camera, image_size, gain, config) and halves_agree_on_lens(lens, image_size, config):
             best = lens
     for start in starts:
         zoom = _find_zoom(start, plain, judge, scene, real, config, grown)
@@ -137,11 +137,12 @@ def _asks_for_zoom(plain: Fitted, config: Config) -> bool:
 
 
 def _is_zoom(zoom: Fitted, plain: Fitted, best: Fitted, judge: TrackJudge, config: Config) -> bool:
-    """Tell whether the focal length changes enough, for most tracks, and explains all together better than the best."""
+    """Tell whether the focal length changes enough, for most tracks, alike in their halves, and explains all better."""
     settings, ratio = config.camera, zoom.camera.zoom
     if ratio is None or ratio.max() / ratio.min() - 1.0 < settings.min_zoom:
         return False
-    return judge.better(zoom, plain)[1] >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0
+    explains = judge.better(zoom, plain)[1] >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0
+    return explains and halves_agree_on_zoom(zoom, config)
 
 
 def lens_strength(camera: CameraModel, image_size: tuple[int, int], config: Config) -> Strength:

@@ -1,9 +1,9 @@
-"""Whether halves of the tracks ask for the same lens.
+"""Whether halves of the tracks ask for the same lens, or for the same zoom.
 
 Whatever tracks slide along, such as outlines or boards of a floor, bends a scene in its own way; if distortion makes up
-for that, it takes away as much energy as a weak lens does. But a lens is the same everywhere and always. So it is
-fitted once more to the first and the last half of what is seen, to the left and right half of the tracks, and to the
-upper and lower one.
+for that, it takes away as much energy as a weak lens does. Cars that pass through much of the picture do the same to
+its size. But a lens is the same everywhere and always, and a zoom is everywhere. So both are fitted once more to the
+first and the last half of what is seen, to the left and right half of the tracks, and to the upper and lower one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.camera_fit import Fitted, fit_lens, scene_of
+from uni4d_fg.cues.structure.camera_fit import Fitted, fit_lens, fit_zoom, scene_of
 from uni4d_fg.cues.structure.selection import mean_pixels
 from uni4d_fg.errors import SolverError
 from uni4d_fg.slam.lens.camera_model import CameraModel
@@ -23,10 +23,12 @@ from uni4d_fg.slam.stages.observations import Observations
 _OPTIONS = {"relative_decrease": 1e-5, "max_iterations": 50}
 _DISAGREE = 1.0 / 3.0
 """Root mean square of how far halves bend the image more or less than all tracks do, as a part of that: 0.01 to 0.25
-for lenses of rendered clips, 0.23 to 0.29 for a k1 of -0.06 on recordings; 0.37 to 3 where there is none."""
+for lenses of rendered clips, 0.23 to 0.29 for a k1 of -0.06 on recordings; 0.37 to 3 where there is none. Of how far
+their zooms are from that of all tracks, as a part of its own: 0.05 to 0.15 for zooms that are one, 0.45 for one that is
+none."""
 
 
-def halves_agree(lens: Fitted, image_size: tuple[int, int], config: Config) -> bool:
+def halves_agree_on_lens(lens: Fitted, image_size: tuple[int, int], config: Config) -> bool:
     """Tell whether halves of the tracks of a scene bend the image about as much as all of them together.
 
     Args:
@@ -45,6 +47,31 @@ def halves_agree(lens: Fitted, image_size: tuple[int, int], config: Config) -> b
             continue
         ratios.append(bend(found.camera, image_size) / whole)
     return not ratios or float(np.sqrt(np.mean((np.array(ratios) - 1.0) ** 2))) <= _DISAGREE
+
+
+def halves_agree_on_zoom(zoom: Fitted, config: Config) -> bool:
+    """Tell whether halves of the tracks of a scene zoom about as all of them together do.
+
+    Args:
+        zoom: Fitted to all.
+        config: Sections ``bundle_adjustment`` and ``camera``.
+
+    Raises:
+        Cancelled: If asked to stop.
+    """
+    assert zoom.camera.zoom is not None
+    whole, off = np.log(zoom.camera.zoom), []
+    for half in halves(zoom.scene.observations):
+        part = _restricted(zoom, half)
+        try:
+            found = fit_zoom(part, config, _OPTIONS)
+        except SolverError:
+            continue
+        assert found.camera.zoom is not None
+        posed = part.scene.registered
+        # The level of a focal length is another matter than its change, and less certain.
+        off.append(float(np.std((np.log(found.camera.zoom) - whole)[posed])))
+    return not off or float(np.sqrt(np.mean(np.square(off)))) <= _DISAGREE * float(np.std(whole))
 
 
 def bend(camera: CameraModel, image_size: tuple[int, int]) -> float:
