@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from cues.start_scenes import GUESS, SIZE, K, TrackedScene, sideways, tracked
 
 from uni4d_fg.config.load import load_config
-from uni4d_fg.cues.structure import camera_search
+from uni4d_fg.cues.structure import camera_search, lens_agreement
+from uni4d_fg.cues.structure.camera_fit import Fitted
 from uni4d_fg.cues.structure.lens_agreement import bend, halves
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
 from uni4d_fg.geometry.lens import Lens
@@ -82,28 +84,30 @@ def test_halves_are_of_time_and_place() -> None:
 ZOOM = CameraModel(K, zoom=1.3 ** np.linspace(-1.0, 0.0, FRAMES))
 
 
-def zoomed(scene: TrackedScene, part: float) -> TrackedScene:
-    """Zoom in on the tracks that begin left of a place, as a part of the picture's width."""
+@pytest.mark.parametrize(
+    ("parts", "agree"),
+    [
+        ((1.0, 1.0, 1.0, 1.0, 1.0, 1.0), True),
+        ((1.0, 1.0, 0.9, 0.9, 1.2, 1.2), True),  # kitchen with dog, cropped from 1 to 1.6
+        ((1.2, 1.1, 0.3, 0.6, 0.8, 0.3), False),  # cars that cross most of the picture
+    ],
+)
+def test_halves_zoom_as_all_do(parts: tuple[float, ...], agree: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tracked(sideways(FRAMES))
+    everything = SimpleNamespace(observations=scene.observations, registered=np.ones(FRAMES, bool))
+    whole = Fitted(ZOOM, everything)  # type: ignore[arg-type]
+    of_half = iter(parts)
+    monkeypatch.setattr(lens_agreement, "_restricted", lambda fitted, _: fitted)
+    # Its level, unlike its change, says nothing.
+    monkeypatch.setattr(
+        lens_agreement, "fit_zoom", lambda *_: Fitted(CameraModel(K, zoom=0.8 * ZOOM.zoom ** next(of_half)), everything)
+    )
+    assert lens_agreement.halves_agree_on_zoom(whole, load_config("default", [])) is agree
+
+
+def test_what_grows_in_all_of_the_picture_is_a_zoom() -> None:
+    scene = tracked(sideways(FRAMES), points=1500)
     seen = scene.observations
-    _, row = seen.rows()
-    _, first = np.unique(row, return_index=True)
-    is_left = (seen.uv[first, 0] < part * SIZE[1])[row]
-    uv = np.where(is_left[:, None], ZOOM.real(seen.uv, seen.frame), seen.uv)
-    return replace(scene, observations=replace(seen, uv=uv))
-
-
-def test_what_grows_in_one_half_of_the_picture_is_no_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = zoomed(tracked(sideways(FRAMES), points=1500), part=0.7)
-    found = solved(scene)
-    assert found.camera.zoom is None
-    monkeypatch.setattr(camera_search, "halves_agree_on_zoom", lambda *_: True)
-    believed = solved(scene)
-    assert believed.camera.zoom is not None
-    assert np.ptp(np.log(believed.camera.zoom)) > 0.1
-
-
-def test_what_grows_in_all_of_it_is_one() -> None:
-    scene = zoomed(tracked(sideways(FRAMES), points=1500), part=1.1)
-    found = solved(scene)
+    found = solved(replace(scene, observations=replace(seen, uv=ZOOM.real(seen.uv, seen.frame))))
     assert found.camera.zoom is not None
     np.testing.assert_allclose(found.intrinsics[0] * found.camera.zoom, K[0] * ZOOM.zoom, rtol=0.03)

@@ -41,7 +41,7 @@ def video_of(simulation: Simulation) -> Video:
 
 def masks_of(
     simulation: Simulation, depths: np.ndarray | None = None, tracks: Tracks | None = None,
-    world_T_cam: np.ndarray | None = None,
+    world_T_cam: np.ndarray | None = None, is_interpolated: bool = False,
 ) -> MotionMasks:  # fmt: skip
     sequence = simulation.sequence
     tracks = sequence.tracks if tracks is None else tracks
@@ -49,7 +49,10 @@ def masks_of(
     # The images are small.
     config = MotionMaskConfig(baselines=(2, 5), depth_edge_px=7, smoothing_px=6, grow_px=1)
     source = sequence.depths if depths is None else ArrayFrames(depths)
-    return motion_masks(video_of(simulation), source, tracks, sequence.intrinsics, config, world_T_cam=world_T_cam)
+    return motion_masks(
+        video_of(simulation), source, tracks, sequence.intrinsics, config, world_T_cam=world_T_cam,
+        is_interpolated=is_interpolated,
+    )  # fmt: skip
 
 
 def overlap(found: np.ndarray, true: np.ndarray) -> float:
@@ -280,6 +283,59 @@ def test_cameras_that_are_known_are_not_solved(moving_scene: Simulation, moving_
     moves = moving_scene.tracks.instance > 0
     assert result.tracks.moving[moves].mean() > 0.9
     assert result.tracks.moving[~moves].mean() < 0.12
+
+
+def test_interpolated_depth_is_not_believed_where_tracks_move(rng: np.random.Generator) -> None:
+    """A thing that goes along with the camera looks like a still one that is nearer; its tracks are known to move."""
+    frames, focal, step, far, near = 14, 150.0, 0.03, 4.0, 1.5
+    textures = [
+        cv2.GaussianBlur(rng.uniform(0, 255, (120, 300, 3)).astype(np.float32), (0, 0), 2.0) * 4 - 3 * 127.5
+        for _ in range(2)
+    ]
+    images, masks = np.empty((frames, 120, 160, 3), np.uint8), np.zeros((frames, 120, 160), bool)
+    for frame in range(frames):
+        shift = [frame * step * focal / depth for depth in (far, near)]
+        scene, thing = (
+            cv2.warpAffine(texture, np.float32([[1, 0, -moved], [0, 1, 0]]), (160, 120), borderMode=cv2.BORDER_REFLECT)
+            for texture, moved in zip(textures, shift, strict=True)
+        )
+        left = round(90 - shift[1])
+        masks[frame, 40:80, left : left + 30] = True
+        images[frame] = np.clip(np.where(masks[frame, ..., None], thing, scene), 0, 255)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = step * np.arange(frames)
+    depths = np.where(masks, near, far).astype(np.float32)
+    at = np.stack(np.meshgrid(np.arange(4, 156, 4), np.arange(4, 116, 4)), axis=-1).reshape(-1, 2).astype(np.float32)
+    moves = masks[0, at[:, 1].astype(int), at[:, 0].astype(int)]
+    moved = np.where(moves[:, None], near, far)
+    uv = np.repeat(at[:, None], frames, axis=1)
+    uv[..., 0] -= np.arange(frames) * step * focal / moved
+    hidden = masks[np.arange(frames), uv[..., 1].astype(int), np.maximum(uv[..., 0], 0).astype(int)] & ~moves[:, None]
+    tracks = Tracks(uv, ~hidden & (uv[..., 0] >= 0), np.zeros(len(at), np.int32))
+    video = Video("thing", ArrayFrames(images), (120, 160), np.arange(frames) / 30)
+    config = MotionMaskConfig(
+        baselines=(2, 5), depth_edge_px=7, smoothing_px=6, grow_px=0, color_reach_px=0, interpolated_threshold=1.0
+    )
+    found = {
+        is_interpolated: np.stack(
+            list(
+                motion_masks(
+                    video,
+                    ArrayFrames(depths),
+                    tracks,
+                    np.array([focal, focal, 79.5, 59.5]),
+                    config,
+                    known_moving=moves,
+                    world_T_cam=poses,
+                    is_interpolated=is_interpolated,
+                ).labels
+            )
+        )
+        for is_interpolated in (False, True)
+    }
+    assert overlap(found[False], masks) < 0.4
+    assert overlap(found[True], masks) > 0.7
+    assert (found[True] > 0)[~masks].mean() < 0.005
 
 
 def test_nothing_is_masked_in_a_static_scene(static_scene: Simulation) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -46,4 +47,15 @@ def test_most_of_the_tried_frames_decide_for_all(
     monkeypatch.setattr(dense_maps, "bleeding_radius", lambda *_: 0.0)
     summary = reconstruct(make_scene(TINY, num_frames=8), tmp_path / "run", make_config())
     assert summary.stages["fusion"]["broken_frames"] == []
+    assert summary.stages["fusion"]["matched_frames"] == all_or_none
+
+
+@pytest.mark.skipif(find_extension()[0] is None, reason="needs the C++ extension")
+@pytest.mark.parametrize(("depth_parallax", "all_or_none"), [(None, 0), (True, 8)])
+def test_depth_between_landmarks_is_not_judged_by_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, depth_parallax: bool | None, all_or_none: int
+) -> None:
+    monkeypatch.setattr(dense_maps, "held_out_errors", lambda *_: HeldOut(0.01, 5.0, True))
+    scene = dataclasses.replace(make_scene(TINY, num_frames=8), depth_parallax=depth_parallax)
+    summary = reconstruct(scene, tmp_path / "run", make_config())
     assert summary.stages["fusion"]["matched_frames"] == all_or_none

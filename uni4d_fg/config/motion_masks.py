@@ -87,6 +87,11 @@ class MotionMaskConfig(Section):
         0.5, "Weight of the evidence of the frames before and after, warped by flow.", ge=0
     )  # fmt: skip
     threshold: float = setting(1.0, "Log odds above which a pixel moves.", basic=True)
+    interpolated_threshold: float = setting(
+        0.5,
+        "The same where depth is interpolated between points of the static scene: what masks miss is then put on what "
+        "is behind it, which costs more than what they hold too much.",
+    )
     min_area_fraction: float = setting(0.002, "Regions smaller than this part of the image are dropped.", ge=0, lt=1)
     max_static_fraction: float = setting(
         0.5, "Regions in which more than this share of the decided tracks is static are dropped.", ge=0, le=1

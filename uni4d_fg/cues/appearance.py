@@ -13,7 +13,7 @@ point is hidden in frame j, and it forgives depth that is off along the epipolar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -66,18 +66,29 @@ def frame_appearance(
     gx, gy = (cv2.Sobel(color, -1, 1 - axis, axis, ksize=3) / 8 for axis in (0, 1))
     window = (config.contrast_window_px, config.contrast_window_px)
     variance = cv2.boxFilter(color * color, -1, window) - cv2.boxFilter(color, -1, window) ** 2
-    scaled = depth * np.float32(np.exp(log_scale))
     gxx, gyy = sum_colors(gx * gx), sum_colors(gy * gy)
-    around = depth_range(scaled, edge_window_px)
     return FrameAppearance(
         color,
         (gxx, sum_colors(gx * gy), gyy),
         sum_colors(np.maximum(variance, 0)),
-        around,
-        np.exp(around.log_depth),
-        config.depth_sigma + 0.5 * around.spread,
+        *_depth_arrays(depth, log_scale, edge_window_px, config),
         3 * config.intensity_sigma**2 + config.prediction_sigma_px**2 * (gxx + gyy),
     )
+
+
+def with_other_depth(
+    frame: FrameAppearance, depth: Float32Array, log_scale: float, edge_window_px: int, config: MotionMaskConfig
+) -> FrameAppearance:
+    """Return a frame with another depth map (h, w); the other arguments are those of :func:`frame_appearance`."""
+    around, z, sigma_depth = _depth_arrays(depth, log_scale, edge_window_px, config)
+    return replace(frame, depth=around, z=z, sigma_depth=sigma_depth)
+
+
+def _depth_arrays(
+    depth: Float32Array, log_scale: float, edge_window_px: int, config: MotionMaskConfig
+) -> tuple[DepthRange, Float32Array, Float32Array]:
+    around = depth_range(depth * np.float32(np.exp(log_scale)), edge_window_px)
+    return around, np.exp(around.log_depth), config.depth_sigma + 0.5 * around.spread
 
 
 def moved_evidence(

@@ -5,8 +5,8 @@
    motion, they are solved before, robustly, and once more without what was found, and the tracks tested again.
 2. Every frame is compared with others before and after it as a static scene would look there
    (:mod:`uni4d_fg.cues.appearance`). Of the two directions the less suspicious one counts: what is hidden in one is
-   mostly seen in the other. Depth that is interpolated between points is that of the scene around, where most tracks
-   move (:mod:`uni4d_fg.cues.behind_moving`).
+   mostly seen in the other. Where most tracks move, depth that is interpolated between points and that of the scene
+   around (:mod:`uni4d_fg.cues.behind_moving`) take turns.
 3. The evidence of pixels and tracks, and of the frames next to it, is smoothed within surfaces of like color; regions
    above a threshold are kept unless their own tracks say that they are static (:mod:`uni4d_fg.cues.moving_regions`).
    They end where colors do (:mod:`uni4d_fg.cues.region_colors`).
@@ -28,7 +28,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.counted import counted
-from uni4d_fg.cues.appearance import FrameAppearance, frame_appearance, moved_evidence
+from uni4d_fg.cues.appearance import FrameAppearance, frame_appearance, moved_evidence, with_other_depth
 from uni4d_fg.cues.behind_moving import depth_behind
 from uni4d_fg.cues.dense_flow import DenseFlow, shrink, shrunk_size, warp_back, working_scale
 from uni4d_fg.cues.depth_range import spread_at_tracks
@@ -244,6 +244,7 @@ class _Comparison:
         self.grid = QuadraticGrid.of(self.size, self.scale, video.image_size)
         self.images: dict[int, ImageArray] = {}
         self.frames: dict[int, FrameAppearance] = {}
+        self.behind: dict[int, FrameAppearance] = {}
         self.said: dict[int, Float32Array] = {}
         self.flow = DenseFlow(fine=False)
 
@@ -274,17 +275,18 @@ class _Comparison:
             height, width = self.size
             image = shrink(self.video.images[frame], self.size)
             depth = cv2.resize(self.depths[frame], (width, height), interpolation=cv2.INTER_NEAREST)
-            self.said[frame] = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
-            if self.is_interpolated:
-                moving = cv2.dilate((self.said[frame] > 0).astype(np.uint8), disk(self.config.behind_reach_px))
-                depth = depth_behind(depth, moving > 0)
             edge = max(1, round(self.config.depth_edge_px * float(self.scale.mean())))
-            self.images[frame] = image
-            self.frames[frame] = frame_appearance(image, depth, float(self.cameras.log_scale[frame]), edge, self.config)
+            at = (float(self.cameras.log_scale[frame]), edge, self.config)
+            said = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
+            self.images[frame], self.said[frame] = image, said
+            self.frames[frame] = self.behind[frame] = frame_appearance(image, depth, *at)
+            if self.is_interpolated and (said > 0).any():
+                moving = cv2.dilate((said > 0).astype(np.uint8), disk(self.config.behind_reach_px)) > 0
+                self.behind[frame] = with_other_depth(self.frames[frame], depth_behind(depth, moving), *at)
         return self.frames[frame]
 
     def _forget_before(self, frame: int) -> None:
-        for kept in (self.frames, self.images, self.said):
+        for kept in (self.frames, self.behind, self.images, self.said):
             for old in [f for f in kept if f < frame]:
                 del kept[old]
 
@@ -321,8 +323,10 @@ class _Comparison:
             plain = self.pixels.camera.is_plain
             shared = self.grid.displacement(error) if plain else self.pixels.displacement(error, source, target)
         pose = relative_pose(self.cameras.world_T_cam, source, target)
-        static = self.pixels.predict(self._frame(source).z, pose, source, target)
-        return moved_evidence(self._frame(source), self._frame(target), static, shared, self.config)
+        # Both hypotheses of what is still have their say, at every second baseline each.
+        frames = self.frames if self.config.baselines.index(abs(target - source)) % 2 else self.behind
+        static = self.pixels.predict(frames[source].z, pose, source, target)
+        return moved_evidence(frames[source], frames[target], static, shared, self.config)
 
     def _regions(self, frame: int, near: dict[int, Float32Array]) -> FrameDetections:
         evidence, weight = near[frame].copy(), self.config.neighbor_frames_weight
@@ -335,7 +339,8 @@ class _Comparison:
             evidence /= 1 + weight * len(others)
         self._frame(frame)
         image = self.images[frame]
-        region = moving_region(evidence, image, self.video.image_size, self.config)
+        threshold = self.config.interpolated_threshold if self.is_interpolated else self.config.threshold
+        region = moving_region(evidence, image, self.video.image_size, threshold, self.config)
         region = np.asarray(self._trusted(region, frame).any(axis=0))
         region = end_at_colors(region, image, self.tracks, self.motion, frame, self.scale, self.config)
         masks = grown(self._trusted(region, frame), self.config.grow_px)

@@ -61,7 +61,7 @@ def working_pixels(uv: Float32Array, size: tuple[int, int], scale: FloatArray) -
 
 
 def moving_region(
-    evidence: Float32Array, image: ImageArray, full_size: tuple[int, int], config: MotionMaskConfig
+    evidence: Float32Array, image: ImageArray, full_size: tuple[int, int], threshold: float, config: MotionMaskConfig
 ) -> BoolArray:
     """Smooth evidence within surfaces of like color and take what exceeds the threshold.
 
@@ -69,7 +69,8 @@ def moving_region(
         evidence: (h, w) log odds at working size.
         image: (h, w, 3) uint8 at working size.
         full_size: (height, width) of the result.
-        config: Smoothing and threshold.
+        threshold: Log odds.
+        config: Smoothing.
 
     Returns:
         (H, W) True where something moves, small holes filled.
@@ -78,7 +79,7 @@ def moving_region(
     radius = max(1, round(config.smoothing_px * evidence.shape[1] / width))
     smooth = guided_filter(np.float32(1 / 255) * image.astype(np.float32), evidence, radius, config.smoothing_contrast)
     full = np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR))
-    region: BoolArray = full > config.threshold
+    region: BoolArray = full > threshold
     return _fill_holes(region, round(config.min_area_fraction * height * width))
 
 

@@ -191,7 +191,7 @@ class DenseMaps:
     def try_matching(self) -> None:
         """Match a few frames to see how far the cue bleeds, and whether landmarks prefer matched depth in most of them.
 
-        A cue that was made from landmarks is not judged by them: matching counts if it bleeds.
+        A cue that was made from landmarks is not judged by them: matching counts if it bleeds. Interpolated depth does.
         """
         if self.unmatched:
             return
@@ -424,6 +424,8 @@ class DenseMaps:
         log_z = log_scale_at + log_cue
         log_scale = float(self.scene["log_scale"][frame])
         errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config, share)
+        if self.sequence.depth_parallax is not None:  # interpolated between these very landmarks
+            errors = errors._replace(telling=False)
         return _Judged(cue, uv, log_z, share, unmasked, static, errors)
 
     def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
