@@ -196,10 +196,9 @@ class DenseMaps:
         if self.unmatched:
             return
         sound = [frame for frame in range(self.sequence.num_frames) if frame not in self.broken]
-        if not self.broken:
+        if not self.broken and not self._is_interpolated:
             middle = sound[len(sound) // 2]
-            errors = self._judged(middle, self.multiview.alone(middle)).errors
-            if adds_nothing(errors):
+            if adds_nothing(self._judged(middle, self.multiview.alone(middle)).errors):
                 self.unmatched = _ADDS_NOTHING
                 return
         tried, bled = list[HeldOut](), list[float]()
@@ -424,8 +423,7 @@ class DenseMaps:
         log_z = log_scale_at + log_cue
         log_scale = float(self.scene["log_scale"][frame])
         errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config, share)
-        if self.sequence.depth_parallax is not None:  # interpolated between these very landmarks
-            errors = errors._replace(telling=False)
+        errors = errors._replace(telling=errors.telling and not self._is_interpolated)  # between these very ones
         return _Judged(cue, uv, log_z, share, unmasked, static, errors)
 
     def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
@@ -438,7 +436,7 @@ class DenseMaps:
         log_scale = float(self.scene["log_scale"][frame])
         return fuse_static(
             judged.cue, measured, known, judged.errors.cue, judged.static, like_moving, log_scale, self.bleeding_px,
-            self.config, frame in self.broken or self.sequence.depth_parallax is not None,
+            self.config, frame in self.broken or self._is_interpolated,
         )  # fmt: skip
 
     def _bleeding(self, frame: int, judged: _Judged, measured: Measured) -> float:
@@ -450,6 +448,10 @@ class DenseMaps:
     def _prefers(self, errors: HeldOut) -> bool:
         """Tell whether matched depth is the better one, as far as a frame says; once it is known whether cues bleed."""
         return is_preferred(errors, self.bleeding_px, poor=self._cue_is_poor)
+
+    @property
+    def _is_interpolated(self) -> bool:
+        return self.sequence.depth_parallax is not None
 
     @property
     def _cue_is_poor(self) -> bool:
