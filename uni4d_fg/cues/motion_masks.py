@@ -222,6 +222,19 @@ def _contradicting(
     return out
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """A frame at working size, (h, w)."""
+
+    image: ImageArray
+    tracks: Float32Array
+    """What its tracks say, from -1 (static) to 1 (moving)."""
+    appearance: FrameAppearance
+    """With the depth that there is."""
+    behind: FrameAppearance
+    """With that of the scene around where most tracks move."""
+
+
 class _Comparison:
     """Frames compared with those around them; a window of frames is held."""
 
@@ -242,10 +255,7 @@ class _Comparison:
         self.scale = np.array([self.size[1] / video.image_size[1], self.size[0] / video.image_size[0]])
         self.pixels = PixelGrid.of(replace(camera, intrinsics=cameras.intrinsics), self.size, video.image_size)
         self.grid = QuadraticGrid.of(self.size, self.scale, video.image_size)
-        self.images: dict[int, ImageArray] = {}
-        self.frames: dict[int, FrameAppearance] = {}
-        self.behind: dict[int, FrameAppearance] = {}
-        self.said: dict[int, Float32Array] = {}
+        self.frames: dict[int, _Prepared] = {}
         self.flow = DenseFlow(fine=False)
 
     def detections(self, stop: Callable[[], bool]) -> Generator[FrameDetections, None, None]:
@@ -270,25 +280,24 @@ class _Comparison:
                     window.popleft()
                 self._forget_before(this - max(self.config.baselines))
 
-    def _frame(self, frame: int) -> FrameAppearance:
+    def _frame(self, frame: int) -> _Prepared:
         if frame not in self.frames:
             height, width = self.size
             image = shrink(self.video.images[frame], self.size)
             depth = cv2.resize(self.depths[frame], (width, height), interpolation=cv2.INTER_NEAREST)
             edge = max(1, round(self.config.depth_edge_px * float(self.scale.mean())))
-            at = (float(self.cameras.log_scale[frame]), edge, self.config)
-            said = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
-            self.images[frame], self.said[frame] = image, said
-            self.frames[frame] = self.behind[frame] = frame_appearance(image, depth, *at)
-            if self.is_interpolated and (said > 0).any():
-                moving = cv2.dilate((said > 0).astype(np.uint8), disk(self.config.behind_reach_px)) > 0
-                self.behind[frame] = with_other_depth(self.frames[frame], depth_behind(depth, moving), *at)
+            settings = (float(self.cameras.log_scale[frame]), edge, self.config)
+            tracks = track_evidence(self.tracks, self.motion, frame, self.size, self.scale, self.config)
+            appearance = behind = frame_appearance(image, depth, *settings)
+            if self.is_interpolated and (tracks > 0).any():
+                moving = cv2.dilate((tracks > 0).astype(np.uint8), disk(self.config.behind_reach_px)) > 0
+                behind = with_other_depth(appearance, depth_behind(depth, moving), *settings)
+            self.frames[frame] = _Prepared(image, tracks, appearance, behind)
         return self.frames[frame]
 
     def _forget_before(self, frame: int) -> None:
-        for kept in (self.frames, self.behind, self.images, self.said):
-            for old in [f for f in kept if f < frame]:
-                del kept[old]
+        for old in [f for f in self.frames if f < frame]:
+            del self.frames[old]
 
     def _pairs(self, frame: int) -> list[list[tuple[int, int]]]:
         """Return the pairs of frames that tell what moves in a frame, by baseline."""
@@ -312,8 +321,7 @@ class _Comparison:
                 count += 1
         if count:
             total *= len(self.config.baselines) / count
-        self._frame(frame)
-        return total + np.float32(self.config.track_weight) * self.said[frame]
+        return total + np.float32(self.config.track_weight) * self._frame(frame).tracks
 
     def _pair(self, pair: tuple[int, int]) -> Float32Array:
         source, target = pair
@@ -324,9 +332,13 @@ class _Comparison:
             shared = self.grid.displacement(error) if plain else self.pixels.displacement(error, source, target)
         pose = relative_pose(self.cameras.world_T_cam, source, target)
         # Both hypotheses of what is still have their say, at every second baseline each.
-        frames = self.frames if self.config.baselines.index(abs(target - source)) % 2 else self.behind
-        static = self.pixels.predict(frames[source].z, pose, source, target)
-        return moved_evidence(frames[source], frames[target], static, shared, self.config)
+        one, other = self._frame(source), self._frame(target)
+        if self.config.baselines.index(abs(target - source)) % 2:
+            ours, theirs = one.appearance, other.appearance
+        else:
+            ours, theirs = one.behind, other.behind
+        static = self.pixels.predict(ours.z, pose, source, target)
+        return moved_evidence(ours, theirs, static, shared, self.config)
 
     def _regions(self, frame: int, near: dict[int, Float32Array]) -> FrameDetections:
         evidence, weight = near[frame].copy(), self.config.neighbor_frames_weight
@@ -337,8 +349,7 @@ class _Comparison:
                 flow = self.flow.between(gray, self._gray(other))
                 evidence += weight * warp_back(near[other], flow)
             evidence /= 1 + weight * len(others)
-        self._frame(frame)
-        image = self.images[frame]
+        image = self._frame(frame).image
         threshold = self.config.interpolated_threshold if self.is_interpolated else self.config.threshold
         region = moving_region(evidence, image, self.video.image_size, threshold, self.config)
         region = np.asarray(self._trusted(region, frame).any(axis=0))
@@ -350,5 +361,4 @@ class _Comparison:
         return trusted_components(region, self.tracks, self.motion, frame, self.config)
 
     def _gray(self, frame: int) -> ImageArray:
-        self._frame(frame)
-        return np.asarray(cv2.cvtColor(self.images[frame], cv2.COLOR_RGB2GRAY))
+        return np.asarray(cv2.cvtColor(self._frame(frame).image, cv2.COLOR_RGB2GRAY))
