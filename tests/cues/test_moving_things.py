@@ -156,3 +156,14 @@ def test_things_without_tracks_and_frames_without_things_are_left_alone() -> Non
         found.add(frame, mask)
     placed = place_moving(({}, {2: 0.3}, {2: 0.4}), found, nothing, np.tile(np.eye(4), (3, 1, 1)), INTRINSICS)
     assert placed.inverse_depth == ({}, {2: 0.3}, {2: 0.4})
+
+
+@pytest.mark.parametrize(("width", "is_cut"), [(0, False), (12, False), (20, True), (40, True)])
+def test_a_foot_or_a_shadow_at_the_lower_border_cuts_nothing_off(width: int, is_cut: bool) -> None:
+    mask = np.zeros((60, 80), np.int32)
+    mask[10:50, 20:60] = 2
+    mask[50:, 20 : 20 + width] = 2
+    tracks = Tracks(np.full((1, 1, 2), 30.0, np.float32), np.ones((1, 1), bool), np.zeros(1, np.int32))
+    seen = Sightings(tracks)
+    seen.add(0, mask)
+    assert seen.cut[2] == [is_cut]

@@ -36,6 +36,9 @@ _MODEL_WRONG = 0.1
 _ON_IT = 0.5
 """A track is on a thing if it is inside its mask in this part of its frames."""
 _MIN_TRACKS = 8
+_CUT_WIDTH = 0.4
+"""A thing is cut off where its mask is wider than this at the image's lower border, as a part of its widest row: what
+reaches down to it and is narrower is a foot or a shadow."""
 
 
 @dataclass
@@ -58,7 +61,8 @@ class Sightings:
         for label in labels.tolist():
             inside = self.inside.setdefault(label, np.zeros(self.tracks.num_tracks, np.int64))
             inside[seen[at == label]] += 1
-            self.cut.setdefault(label, []).append(bool((mask[-1] == label).any()))
+            width = np.count_nonzero(mask == label, axis=1)
+            self.cut.setdefault(label, []).append(bool(width[-1] > _CUT_WIDTH * width.max()))
 
     def on(self, label: int) -> BoolArray:
         """Return which tracks (K,) are on a thing."""
