@@ -8,11 +8,13 @@ first and the last half of what is seen, to the left and right half of the track
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray
+from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.camera_fit import Fitted, fit_lens, fit_zoom, scene_of
 from uni4d_fg.cues.structure.selection import mean_pixels
@@ -39,14 +41,9 @@ def halves_agree_on_lens(lens: Fitted, image_size: tuple[int, int], config: Conf
     Raises:
         Cancelled: If asked to stop.
     """
-    whole, ratios = bend(lens.camera, image_size), []
-    for half in halves(lens.scene.observations):
-        try:
-            found = fit_lens(_restricted(lens, half), lens.camera.lens.model, config, _OPTIONS)
-        except SolverError:  # Too few say nothing.
-            continue
-        ratios.append(bend(found.camera, image_size) / whole)
-    return not ratios or float(np.sqrt(np.mean((np.array(ratios) - 1.0) ** 2))) <= _DISAGREE
+    whole = bend(lens.camera, image_size)
+    found = _fitted_to_halves(lens, lambda half: fit_lens(half, lens.camera.lens.model, config, _OPTIONS))
+    return _agree([bend(one.camera, image_size) / whole - 1.0 for one in found])
 
 
 def halves_agree_on_zoom(zoom: Fitted, config: Config) -> bool:
@@ -59,19 +56,11 @@ def halves_agree_on_zoom(zoom: Fitted, config: Config) -> bool:
     Raises:
         Cancelled: If asked to stop.
     """
-    assert zoom.camera.zoom is not None
-    whole, off = np.log(zoom.camera.zoom), []
-    for half in halves(zoom.scene.observations):
-        part = _restricted(zoom, half)
-        try:
-            found = fit_zoom(part, config, _OPTIONS)
-        except SolverError:
-            continue
-        assert found.camera.zoom is not None
-        posed = part.scene.registered
-        # The level of a focal length is another matter than its change, and less certain.
-        off.append(float(np.std((np.log(found.camera.zoom) - whole)[posed])))
-    return not off or float(np.sqrt(np.mean(np.square(off)))) <= _DISAGREE * float(np.std(whole))
+    whole = _log_zoom(zoom)
+    found = _fitted_to_halves(zoom, lambda half: fit_zoom(half, config, _OPTIONS))
+    # The level of a focal length is another matter than its change, and less certain.
+    off = [np.std((_log_zoom(one) - whole)[one.scene.registered]) for one in found]
+    return _agree([float(deviation / np.std(whole)) for deviation in off])
 
 
 def bend(camera: CameraModel, image_size: tuple[int, int]) -> float:
@@ -94,6 +83,25 @@ def halves(observations: Observations) -> list[BoolArray]:
     late = observations.frame > np.median(observations.frame)
     right, lower = (pixels >= np.median(pixels, axis=0))[row].T
     return [part for one in (late, right, lower) for part in (~one, one)]
+
+
+def _fitted_to_halves(whole: Fitted, fit: Callable[[Fitted], Fitted]) -> list[Fitted]:
+    """Return what is fitted to each half of the tracks; too few to be solved say nothing."""
+    found = []
+    for half in halves(whole.scene.observations):
+        with suppress(SolverError):
+            found.append(fit(_restricted(whole, half)))
+    return found
+
+
+def _agree(off: list[float]) -> bool:
+    """Tell whether halves are near to the whole, from by which part of it each is off."""
+    return not off or float(np.sqrt(np.mean(np.square(off)))) <= _DISAGREE
+
+
+def _log_zoom(fitted: Fitted) -> FloatArray:
+    assert fitted.camera.zoom is not None
+    return np.log(fitted.camera.zoom)
 
 
 def _restricted(lens: Fitted, which: BoolArray) -> Fitted:
