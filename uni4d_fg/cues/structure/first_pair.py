@@ -13,6 +13,10 @@ from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.structure.two_view import Parallax, parallax
 from uni4d_fg.slam.stages.observations import Observations
 
+_BESIDE_A_WALL = 2.0
+"""A pair will do, too, if a quarter of the tracks has so many times the parallax that the median needs: the rest may be
+a wall."""
+
 
 @dataclass(frozen=True)
 class FramePair:
@@ -92,6 +96,12 @@ def common_pixels(
                 break  # tracks only get fewer
             used = evenly_spread(len(a), config.fitted_tracks)
             yield CommonPixels(first, second, observations.uv[a[used]], observations.uv[b[used]], len(a))
+
+
+def has_parallax(pair: FramePair, config: GeometricDepthConfig) -> bool:
+    """Tell whether two frames show parallax enough to start from."""
+    least = config.min_parallax_px
+    return pair.parallax.median >= least or pair.parallax.upper >= _BESIDE_A_WALL * least
 
 
 def _worth(pair: FramePair, config: GeometricDepthConfig) -> float:

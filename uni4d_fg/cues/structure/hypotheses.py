@@ -10,7 +10,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.first_pair import FramePair, rank_pairs
+from uni4d_fg.cues.structure.first_pair import FramePair, has_parallax, rank_pairs
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.judging import HeldOut, held_out
@@ -33,9 +33,6 @@ _ENOUGH = 0.2
 """Starts that explain less than this part of what is held out do not tell the noise of the tracks."""
 _OVERLAP = 0.5
 """Pairs that overlap by more than this part of their union are one start."""
-_BESIDE_A_WALL = 2.0
-"""A pair will do, too, if a quarter of the tracks has so many times the parallax that the median needs: the rest may be
-a wall."""
 _SIDE = 0.25
 """Part of the picture's width that a side of it has."""
 
@@ -149,10 +146,7 @@ class Competition:
         if len(seen) == 0:
             return []
         ranked = rank_pairs(seen, self.num_frames, self.intrinsics, settings, known_focal=not self.free_focal)
-        least = settings.min_parallax_px
-        return [
-            pair for pair in ranked if pair.parallax.median >= least or pair.parallax.upper >= _BESIDE_A_WALL * least
-        ]
+        return [pair for pair in ranked if has_parallax(pair, settings)]
 
     def trial(self, pair: FramePair, factor: float, part: Part) -> Hypothesis | None:
         """Start from a pair, add frames around it, and judge; None if the pair gives no points."""

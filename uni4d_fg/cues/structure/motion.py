@@ -20,6 +20,7 @@ from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, ranked
 from uni4d_fg.cues.structure.judging import errors_of
+from uni4d_fg.cues.structure.passing_thing import is_of_passing_thing
 from uni4d_fg.cues.structure.readout import at_one_time, find_readout, is_told_still
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import NEARLY_AS_WELL, Rival, rivals_of
@@ -251,7 +252,7 @@ class _Search:
     start: StartCameras | None = None
 
     def grow(self, observations: Observations, intrinsics: FloatArray, free_focal: bool) -> _Grown | None:
-        """Let starts compete, and grow and trim the best; None if no two frames have parallax."""
+        """Let starts compete, and grow and trim the best; None if no two frames have parallax, but for what passes."""
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
         epipolar = epipolar_geometry(used, self.num_frames, self.image_size, settings)
@@ -270,6 +271,8 @@ class _Search:
             other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
             if other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, side.pair)]
+        if free_focal and is_of_passing_thing(scene, used, self.image_size, intrinsics, settings):
+            return None
         return _Grown(scene, hypotheses, used)
 
     def _grown_best(

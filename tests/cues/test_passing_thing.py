@@ -1,0 +1,113 @@
+"""A large thing that passes a camera that only turns is not taken for the world."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from cues.start_scenes import GUESS, SIZE, K
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure import motion
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.motion import structure_from_motion
+from uni4d_fg.cues.structure.passing_thing import is_of_passing_thing
+from uni4d_fg.geometry import se3
+from uni4d_fg.geometry.camera import project, unproject, world_to_camera
+from uni4d_fg.progress import SilentReporter
+from uni4d_fg.slam.stages.observations import Observations
+
+CONFIG = load_config("default", [])
+FRAMES, BUS = 40, 300
+PASSED = 5.0
+"""How far the bus goes, m."""
+
+
+class Street(NamedTuple):
+    """What a camera held by hand before a street sees."""
+
+    observations: Observations
+    world_T_cam: np.ndarray
+    bus_T_cam: np.ndarray
+    """Cameras, seen from the bus."""
+
+
+def passing(seed: int, points: int = 800, sway: float = 0.11, turn: float = 0.06, cabin: bool = False) -> Street:
+    """A street 6 to 16 m away, and a bus 4 m away that passes.
+
+    Args:
+        seed: Of points and noise.
+        points: Number of those of the street.
+        sway: How far the camera moves up and down, m.
+        turn: How far it turns, rad.
+        cabin: What is seen beside the bus is fixed to the camera.
+    """
+    rng = np.random.default_rng(seed)
+    part = np.linspace(0.0, 1.0, FRAMES)
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, 1, 3] = sway * np.sin(9 * part)
+    poses[:, :3, :3] = se3.so3_exp(turn * np.stack([0.3 * np.sin(8 * part), part, 0.1 * np.sin(6 * part)], axis=1))
+    street = unproject(K, rng.uniform((-20, 0), (340, 240), (points, 2)), rng.uniform(6.0, 16.0, points))
+    bus = rng.uniform((-8.0, -0.6, 4.0), (0.5, 0.6, 4.4), (BUS, 3))
+    seen_from_bus = poses.copy()
+    seen_from_bus[:, 0, 3] -= PASSED * part
+    rows = []
+    for frame in range(FRAMES):
+        beside = world_to_camera(np.eye(4) if cabin else poses[frame], street)
+        uv = project(K, np.concatenate([beside, world_to_camera(seen_from_bus[frame], bus)]))
+        uv += rng.normal(0, 0.15, uv.shape)
+        seen = np.flatnonzero((uv > 0).all(axis=1) & (uv[:, 0] < SIZE[1]) & (uv[:, 1] < SIZE[0]))
+        rows.append((seen, np.full(len(seen), frame), uv[seen]))
+    track, frame_of, uv = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    order = np.lexsort([frame_of, track])
+    observations = Observations(
+        track[order].astype(np.int64), frame_of[order].astype(np.int64), uv[order], np.full(len(order), np.nan),
+        np.ones(len(order)),
+    )  # fmt: skip
+    return Street(observations.with_min_observations(5), poses, seen_from_bus)
+
+
+def is_passing(street: Street, world_T_cam: np.ndarray) -> bool:
+    """Judge cameras that see the street."""
+    scene = GrowingScene.empty(
+        street.observations, FRAMES, K, CONFIG, free_focal=True, prior_intrinsics=GUESS, should_stop=lambda: False
+    )
+    scene.world_T_cam, scene.registered[:] = world_T_cam.copy(), True
+    scene.triangulate_all()
+    scene.limit_px[:] = 0.7
+    return is_of_passing_thing(scene, street.observations, SIZE, GUESS, CONFIG.geometric_depth)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cameras_of_what_passes_are_told_from_those_of_the_world(seed: int) -> None:
+    street = passing(seed)
+    assert is_passing(street, street.bus_T_cam)
+    assert not is_passing(street, street.world_T_cam)
+
+
+def test_a_street_that_shows_parallax_leads_to_cameras_of_its_own() -> None:
+    street = passing(0, sway=0.8)
+    assert not is_passing(street, street.bus_T_cam)
+
+
+def test_what_is_fixed_to_the_camera_is_not_the_world() -> None:
+    """Outside a cabin that hides most of it, the world passes: that the cabin does not turn tells them apart."""
+    cabin = passing(0, cabin=True)
+    assert not is_passing(cabin, cabin.bus_T_cam)
+
+
+def test_what_most_of_the_tracks_agree_with_is_the_world() -> None:
+    street = passing(0, points=150)
+    assert not is_passing(street, street.bus_T_cam)
+
+
+def test_without_another_scene_the_camera_only_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    street = passing(0, sway=0.6)
+
+    def found() -> object:
+        return structure_from_motion(street.observations, FRAMES, SIZE, GUESS, CONFIG, SilentReporter(), lambda: False)
+
+    assert found() is not None
+    monkeypatch.setattr(motion, "is_of_passing_thing", lambda *_: True)
+    assert found() is None

@@ -1,0 +1,69 @@
+"""Whether cameras are those of a thing that passes, while a camera that only turns explains most of the picture.
+
+A bus that passes a camera which hardly moves shows far more parallax than the street. Seen from the bus the camera
+moves, the bus is the world, and the street, which only seems to turn, is about as good as infinitely far away: so every
+start leads there. Such cameras explain few tracks to within their noise; what they leave over lies all around, and
+between any two frames a rotation explains it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.config.geometric_depth import GeometricDepthConfig
+from uni4d_fg.cues.structure.first_pair import common_pixels, has_parallax, rank_pairs
+from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.hypotheses import at_sides
+from uni4d_fg.cues.structure.judging import errors_of
+from uni4d_fg.slam.stages.observations import Observations
+
+_MOST = 0.5
+"""Part of the tracks, in the picture and at its sides, that is left over: 0.08 to 0.25 by cameras of eight clips, 0.69
+by those of a bus. People who fill the middle of the picture leave its sides to the world."""
+_TURNED = 5.0
+"""Times the least parallax by which what is left over moves, at least: a thing that is fixed to the camera does not."""
+
+
+def is_of_passing_thing(
+    scene: GrowingScene,
+    used: Observations,
+    image_size: tuple[int, int],
+    intrinsics: FloatArray,
+    config: GeometricDepthConfig,
+) -> bool:
+    """Tell whether the cameras of a grown scene are those of a thing that passes a camera that only turns.
+
+    Args:
+        scene: Grown and trimmed.
+        used: Observations of tracks all over the picture.
+        image_size: (height, width), px.
+        intrinsics: (4,) px, of which the principal point serves; the focal lengths are free.
+        config: Thresholds.
+    """
+    over = _left_over(scene, used)
+    if not (_is_most(over, used) and _is_most(over, used, at_sides(used, image_size))):
+        return False
+    rest, frames = used.select(over), len(scene.registered)
+    if any(has_parallax(pair, config) for pair in rank_pairs(rest, frames, intrinsics, config, known_focal=False)):
+        return False
+    moved = [
+        float(np.median(np.linalg.norm(seen.uv_second - seen.uv_first, axis=1)))
+        for seen in common_pixels(rest, frames, config.sampled_frames, config)
+    ]
+    return max(moved, default=0.0) >= _TURNED * config.min_parallax_px
+
+
+def _left_over(scene: GrowingScene, used: Observations) -> BoolArray:
+    """Return which observations (N,) are of tracks of which more than half are beyond the limit of a scene."""
+    beyond = errors_of(scene.seeing(used), used) > scene.limit_px[used.frame]
+    tracks, row = used.rows()
+    over = 2 * np.bincount(row, beyond, len(tracks)) > np.bincount(row, minlength=len(tracks))
+    return np.asarray(over[row])
+
+
+def _is_most(over: BoolArray, used: Observations, where: BoolArray | None = None) -> bool:
+    """Tell whether most tracks are left over, of all or of those whose observations (N,) are chosen."""
+    inside = np.ones(len(over), dtype=bool) if where is None else where
+    tracks = len(np.unique(used.track[inside]))
+    return len(np.unique(used.track[inside & over])) > _MOST * tracks
