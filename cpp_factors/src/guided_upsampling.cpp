@@ -3,9 +3,9 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <cstring>
 #include <vector>
 
+#include "exp_minus.hpp"
 #include "uni4d_fg/parallel.hpp"
 #include "uni4d_fg/simd.hpp"
 
@@ -18,19 +18,6 @@ constexpr int kChunk = 128;
 constexpr int kTaps = 3;             // pixels of the map that are looked at, in each direction
 constexpr float kFarthest = 60.0F;   // exponent beyond which colors are equally unlike
 constexpr float kLeastWeight = 1e-12F;
-
-/// exp(-x) for x in [0, 87], to 2e-7 of itself, without a branch or a call.
-UNI4D_FG_INLINE float exp_minus(float x) {
-  const float t = -1.44269504F * x;                            // exp(-x) = 2^t
-  const int whole = static_cast<int>(t - 0.5F);                // t is not positive: rounded to the nearest
-  const float f = 0.693147181F * (t - static_cast<float>(whole));
-  const float value =
-      1.0F + f * (1.0F + f * (0.5F + f * (1.0F / 6 + f * (1.0F / 24 + f * (1.0F / 120 + f * (1.0F / 720))))));
-  const std::int32_t bits = (whole + 127) << 23;
-  float scale;
-  std::memcpy(&scale, &bits, sizeof scale);
-  return value * scale;
-}
 
 /// Where the pixels of one side fall in the map: for each of the taps, which pixel that is and how much it weighs.
 struct Taps {

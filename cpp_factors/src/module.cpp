@@ -11,6 +11,7 @@ void bind_trajectory_system(nb::module_& module);
 void bind_patch_registration(nb::module_& module);
 void bind_plane_sweep(nb::module_& module);
 void bind_frame_comparison(nb::module_& module);
+void bind_guided_median(nb::module_& module);
 void bind_guided_upsampling(nb::module_& module);
 void bind_triangulation(nb::module_& module);
 }  // namespace uni4d_fg
@@ -20,7 +21,7 @@ NB_MODULE(_core, module) {
   // Objects that outlive the interpreter's own clean-up (in a failed test, say) are no reason to print.
   nb::set_leak_warnings(false);
   // Raised by every new entry point and every change of a signature or of a meaning.
-  module.attr("ABI") = 7;
+  module.attr("ABI") = 8;
   uni4d_fg::bind_factor_types(module);
   uni4d_fg::bind_whitening(module);
   uni4d_fg::bind_pair_system(module);
@@ -29,6 +30,7 @@ NB_MODULE(_core, module) {
   uni4d_fg::bind_patch_registration(module);
   uni4d_fg::bind_plane_sweep(module);
   uni4d_fg::bind_frame_comparison(module);
+  uni4d_fg::bind_guided_median(module);
   uni4d_fg::bind_guided_upsampling(module);
   uni4d_fg::bind_triangulation(module);
 }

@@ -14,7 +14,7 @@ namespace {
 
 constexpr int kUnknown = 128;  // matching cost where nothing is known: halfway between like and unlike
 constexpr int kNoViewYet = 255;
-constexpr int kBandRows = 12;
+constexpr int kBandRows = 40;
 constexpr int kChunk = 128;  // pixels of a row that are worked on together
 
 /// What the matching of a band of rows works in.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uni4d_fg.results.fusion.guided_median import guided_median
+from uni4d_fg.optim.extension import find_extension
+from uni4d_fg.results.fusion.guided_median import guided_median, guided_median_numpy
 
 SHAPE = (40, 60)
 EVERYWHERE = np.ones(SHAPE, bool)
@@ -56,3 +58,46 @@ def test_depth_stays_among_what_is_there(seed: int, side: int) -> None:
     found = guided_median(depth, rng.random(depth.shape).astype(np.float32), np.ones(depth.shape, bool), image)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(depth))
     assert np.isin(found[np.isfinite(found)], depth[np.isfinite(depth)]).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(40, 60), (3, 50), (1, 1)])
+def test_cpp_and_numpy_agree(rng: np.random.Generator, height: int, width: int) -> None:
+    core, reason = find_extension()
+    if core is None:
+        pytest.skip(reason)
+    values = rng.normal(1.0, 0.5, (height, width)).astype(np.float32)
+    weights = rng.uniform(0.001, 1.0, (height, width)).astype(np.float32)
+    weights[:, 10:20] = 0.0
+    values[:, 12:18] = np.nan
+    colors = rng.normal(0, 1.5, (height, width, 3)).astype(np.float32)
+    chosen = (rng.random((height, width)) < 0.8) & (weights > 0)
+    slow = guided_median_numpy(values, weights, colors, chosen)
+    fast = core.guided_median(values, weights, colors, chosen.astype(np.uint8), reach=4, step=2, spatial=3.0)
+    np.testing.assert_array_equal(fast[~chosen], values[~chosen])
+    # Where half of the weight is met to the last bits, the next value may be taken.
+    assert (fast == slow)[chosen].mean() > 0.999
+    assert not chosen.any() or height < 40 or (fast != values)[chosen].mean() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"values": np.ones((3, 4))}, "values: expected float32"),
+        ({"weights": np.ones((3, 5), np.float32)}, "weights: expected"),
+        ({"colors": np.ones((3, 4), np.float32)}, "colors: expected float32"),
+        ({"chosen": np.ones((3, 4), bool)}, "chosen: expected uint8"),
+        ({"step": 0}, "reach, step"),
+        ({"spatial": 0.0}, "spatial"),
+    ],
+)
+def test_bad_input_is_named(wrong: dict[str, object], message: str) -> None:
+    core, reason = find_extension()
+    if core is None:
+        pytest.skip(reason)
+    given_all = {
+        "values": np.ones((3, 4), np.float32), "weights": np.ones((3, 4), np.float32),
+        "colors": np.ones((3, 4, 3), np.float32), "chosen": np.ones((3, 4), np.uint8),
+        "reach": 4, "step": 2, "spatial": 3.0,
+    }  # fmt: skip
+    with pytest.raises(ValueError, match=message):
+        core.guided_median(**(given_all | wrong))

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
+from uni4d_fg.optim.extension import find_extension
 
 _UNSURE = 0.5
 """Pixels of a lower confidence are replaced."""
@@ -39,25 +40,49 @@ def guided_median(
     """
     height, width = log_depth.shape
     known = np.isfinite(log_depth)
-    row, column = np.nonzero(known & static & (confidence < _UNSURE))
-    if not row.size:
+    chosen = known & static & (confidence < _UNSURE)
+    if not chosen.any():
         return log_depth
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    color = small.reshape(-1, 3).astype(np.float32) / np.float32(255 * np.sqrt(2.0) * _COLOR)
-    weight = np.where(known, confidence + _LEAST, np.float32(0)).ravel()
-    depth, own = np.where(known, log_depth, np.float32(0)).ravel(), color[row * width + column]
+    colors = small.astype(np.float32) / np.float32(255 * np.sqrt(2.0) * _COLOR)
+    weights = np.where(known, confidence + _LEAST, np.float32(0)).astype(np.float32)
+    core, _ = find_extension()
+    if core is None:
+        return guided_median_numpy(log_depth, weights, colors, chosen)
+    found: Float32Array = core.guided_median(
+        np.ascontiguousarray(log_depth, dtype=np.float32), weights, colors, chosen.astype(np.uint8),
+        reach=_REACH_PX, step=_STEP_PX, spatial=_SPATIAL_PX,
+    )  # fmt: skip
+    return found
+
+
+def guided_median_numpy(
+    values: Float32Array, weights: Float32Array, colors: Float32Array, chosen: BoolArray
+) -> Float32Array:
+    """Do what ``cpp_factors/src/guided_median.cpp`` does.
+
+    Args:
+        values: (h, w), finite where they weigh anything.
+        weights: (h, w), 0 where the map is missing.
+        colors: (h, w, 3) in units of sqrt(2) standard deviations of the weights by color.
+        chosen: (h, w) pixels that take the median.
+    """
+    height, width = values.shape
+    row, column = np.nonzero(chosen)
+    color, weight = colors.reshape(-1, 3), weights.ravel()
+    value, own = np.where(weights > 0, values, np.float32(0)).ravel(), color[row * width + column]
     taps = range(-_REACH_PX, _REACH_PX + 1, _STEP_PX)
-    values = np.empty((len(taps) ** 2, row.size), np.float32)
-    weights = np.empty_like(values)
+    around = np.empty((len(taps) ** 2, row.size), np.float32)
+    weighed = np.empty_like(around)
     for number, (dy, dx) in enumerate((dy, dx) for dy in taps for dx in taps):
         inside = (row + dy >= 0) & (row + dy < height) & (column + dx >= 0) & (column + dx < width)
         at = np.where(inside, (row + dy) * width + column + dx, 0)
         unlike = ((color[at] - own) ** 2).sum(axis=1) + np.float32((dy * dy + dx * dx) / (2 * _SPATIAL_PX**2))
-        values[number] = depth[at]
-        weights[number] = np.where(inside, weight[at] * np.exp(-np.minimum(unlike, _FARTHEST)), np.float32(0))
-    order = np.argsort(values, axis=0)
-    mass = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+        around[number] = value[at]
+        weighed[number] = np.where(inside, weight[at] * np.exp(-np.minimum(unlike, _FARTHEST)), np.float32(0))
+    order = np.argsort(around, axis=0)
+    mass = np.cumsum(np.take_along_axis(weighed, order, axis=0), axis=0)
     middle = np.argmax(mass >= 0.5 * mass[-1:], axis=0)
-    out = log_depth.copy()
-    out[row, column] = values[order[middle, np.arange(row.size)], np.arange(row.size)]
+    out = values.copy()
+    out[row, column] = around[order[middle, np.arange(row.size)], np.arange(row.size)]
     return out

@@ -1,0 +1,28 @@
+// A weighted median of the values around chosen pixels, guided by the colors of an image.
+//
+// `results/fusion/guided_median.py` is the same in NumPy, and says what it is for.
+#pragma once
+
+#include <cstdint>
+
+namespace uni4d_fg {
+
+/// What is looked at around a pixel: every `step`-th pixel of a window of half side `reach`, less by distance.
+struct MedianWindow {
+  int reach = 4, step = 2;
+  float spatial = 3.0F;  // standard deviation of the weights by distance, pixels
+};
+
+/// A map (height, width) that is finite where its weight is above 0, and colors (height, width, 3) in units of
+/// sqrt(2) standard deviations of the weights by color.
+struct WeightedMap {
+  const float* values = nullptr;
+  const float* weights = nullptr;
+  const float* colors = nullptr;
+  int height = 0, width = 0;
+};
+
+/// `out` (height, width): the map, with a weighted median where `chosen` is not 0.
+void guided_median(const WeightedMap& map, const std::uint8_t* chosen, const MedianWindow& window, float* out);
+
+}  // namespace uni4d_fg
