@@ -80,24 +80,26 @@ def test_the_apparent_size_follows_a_thing_that_comes_near() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "sigma", "cut", "stands", "factor"),
+    ("ratio", "sigma", "cut", "stands", "factor", "contradicts"),
     [
-        (0.0, np.inf, False, True, 1.0),
-        (1.05, 0.1, False, True, 1.04),
-        (2.5, 0.15, False, False, 2.5),
-        (10.0, 4.0, False, True, 1.0),  # nearly nothing
-        (-30.0, 10.0, False, True, 1.0),  # not a motion that the model has
-        (0.4, 0.1, False, True, 1.0),  # nothing is behind what it hides
-        (2.5, 0.15, True, False, 2.5),
-        (0.0, np.inf, True, False, 1.8),
+        (0.0, np.inf, False, True, 1.0, False),
+        (1.05, 0.1, False, True, 1.04, False),
+        (2.5, 0.15, False, False, 2.5, False),
+        (10.0, 4.0, False, True, 1.0, False),  # nearly nothing
+        (-30.0, 10.0, False, True, 1.0, True),  # not a motion that the model has
+        (-3.0, 0.1, True, False, 1.8, True),
+        (0.4, 0.1, False, True, 1.0, True),  # nothing is behind what it hides
+        (2.5, 0.15, True, False, 2.5, False),
+        (0.0, np.inf, True, False, 1.8, False),
     ],
 )
 def test_standing_and_being_nearer_are_weighed(
-    ratio: float, sigma: float, cut: bool, stands: bool, factor: float
+    ratio: float, sigma: float, cut: bool, stands: bool, factor: float, contradicts: bool
 ) -> None:
-    found, log_ratio = weigh(ratio, sigma, cut)
-    assert found == stands
-    assert np.exp(log_ratio) == pytest.approx(factor, rel=0.1, abs=0.01)
+    found = weigh(ratio, sigma, cut)
+    assert found.stands == stands
+    assert np.exp(found.log_ratio) == pytest.approx(factor, rel=0.1, abs=0.01)
+    assert found.contradicts == contradicts
 
 
 def sightings(tracks: Tracks, rows: slice) -> Sightings:
@@ -133,6 +135,7 @@ def test_without_shake_it_stays_where_it_may_stand_and_a_thing_that_is_cut_off_i
     assert not placed.open
     cut = place_moving(contacts, sightings(tracks, slice(0, 240)), tracks, poses(centers), INTRINSICS)
     assert cut.open == [3]
+    assert not cut.nearer  # that it is nearer than what is seen below is a guess
 
 
 def test_frames_whose_masks_lose_feet_follow_the_others_by_apparent_size() -> None:

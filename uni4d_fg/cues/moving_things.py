@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -118,19 +119,30 @@ def place_moving(
                 continue
             size = parallax.size[np.array(frames) - parallax.first]
             standing = float(np.quantile([contacts[frame][label] for frame in frames] / size, NEAREST_SHARE))
-            stands, log_ratio = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut)
-            shown |= parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
+            weighed = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut)
+            tells = not weighed.contradicts and parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
+            shown |= tells
             for frame, here in zip(frames, size.tolist(), strict=True):
-                placed[frame][label] = np.exp(log_ratio) * standing * here
-            if not stands:
-                nearer.setdefault(label, []).append(float(np.exp(log_ratio)))
+                placed[frame][label] = np.exp(weighed.log_ratio) * standing * here
+            if tells and not weighed.stands:
+                nearer.setdefault(label, []).append(float(np.exp(weighed.log_ratio)))
         if cut and not shown:
             unknown.append(label)
     return Placed(tuple(placed), {label: float(np.median(ratios)) for label, ratios in nearer.items()}, unknown)
 
 
-def weigh(ratio: float, sigma: float, cut: bool) -> tuple[bool, float]:
-    """Return whether a thing stands, and the mean of ``log rho`` if so.
+class Weighed(NamedTuple):
+    """What parallax tells of a thing."""
+
+    stands: bool
+    log_ratio: float
+    """Mean of ``log rho`` if so, or if not."""
+    contradicts: bool
+    """No ratio explains the parallax: what is said of the thing is what holds for most."""
+
+
+def weigh(ratio: float, sigma: float, cut: bool) -> Weighed:
+    """Weigh that a thing stands against that it is nearer.
 
     Args:
         ratio: Inverse depth from parallax over that of the surface below.
@@ -149,5 +161,6 @@ def weigh(ratio: float, sigma: float, cut: bool) -> tuple[bool, float]:
     weights = [hypothesis * (likelihood + wrong) for hypothesis in (standing, nearer)]
     stands = bool(weights[0].sum() >= weights[1].sum())
     chosen = weights[0] if stands else weights[1]
+    told = float(((standing + nearer) * likelihood).sum())
     # Nothing is behind what it hides: that it seems so comes from errors of the cameras, which make it too far.
-    return stands, max(float(_LOG_RATIO @ chosen / chosen.sum()), 0.0)
+    return Weighed(stands, max(float(_LOG_RATIO @ chosen / chosen.sum()), 0.0), told < wrong)
