@@ -68,7 +68,7 @@ def passing(seed: int, points: int = 800, sway: float = 0.11, turn: float = 0.06
     return Street(observations.with_min_observations(5), poses, seen_from_bus)
 
 
-def is_passing(street: Street, world_T_cam: np.ndarray) -> bool:
+def is_passing(street: Street, world_T_cam: np.ndarray, known_focal: bool = False) -> bool:
     """Judge cameras that see the street."""
     scene = GrowingScene.empty(
         street.observations, FRAMES, K, CONFIG, free_focal=True, prior_intrinsics=GUESS, should_stop=lambda: False
@@ -76,14 +76,17 @@ def is_passing(street: Street, world_T_cam: np.ndarray) -> bool:
     scene.world_T_cam, scene.registered[:] = world_T_cam.copy(), True
     scene.triangulate_all()
     scene.limit_px[:] = 0.7
-    return is_of_passing_thing(scene, street.observations, SIZE, GUESS, CONFIG.geometric_depth)
+    return is_of_passing_thing(
+        scene, street.observations, SIZE, K if known_focal else GUESS, CONFIG.geometric_depth, known_focal=known_focal
+    )
 
 
+@pytest.mark.parametrize("known_focal", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_cameras_of_what_passes_are_told_from_those_of_the_world(seed: int) -> None:
+def test_cameras_of_what_passes_are_told_from_those_of_the_world(seed: int, known_focal: bool) -> None:
     street = passing(seed)
-    assert is_passing(street, street.bus_T_cam)
-    assert not is_passing(street, street.world_T_cam)
+    assert is_passing(street, street.bus_T_cam, known_focal)
+    assert not is_passing(street, street.world_T_cam, known_focal)
 
 
 def test_a_street_that_shows_parallax_leads_to_cameras_of_its_own() -> None:
@@ -109,5 +112,5 @@ def test_without_another_scene_the_camera_only_turns(monkeypatch: pytest.MonkeyP
         return structure_from_motion(street.observations, FRAMES, SIZE, GUESS, CONFIG, SilentReporter(), lambda: False)
 
     assert found() is not None
-    monkeypatch.setattr(motion, "is_of_passing_thing", lambda *_: True)
+    monkeypatch.setattr(motion, "is_of_passing_thing", lambda *_, **__: True)
     assert found() is None

@@ -271,7 +271,7 @@ class _Search:
             other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
             if other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, side.pair)]
-        if free_focal and is_of_passing_thing(scene, used, self.image_size, intrinsics, settings):
+        if is_of_passing_thing(scene, used, self.image_size, intrinsics, settings, known_focal=not free_focal):
             return None
         return _Grown(scene, hypotheses, used)
 

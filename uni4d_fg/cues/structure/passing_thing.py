@@ -31,6 +31,8 @@ def is_of_passing_thing(
     image_size: tuple[int, int],
     intrinsics: FloatArray,
     config: GeometricDepthConfig,
+    *,
+    known_focal: bool,
 ) -> bool:
     """Tell whether the cameras of a grown scene are those of a thing that passes a camera that only turns.
 
@@ -38,14 +40,16 @@ def is_of_passing_thing(
         scene: Grown and trimmed.
         used: Observations of tracks all over the picture.
         image_size: (height, width), px.
-        intrinsics: (4,) px, of which the principal point serves; the focal lengths are free.
+        intrinsics: (4,) px.
         config: Thresholds.
+        known_focal: Whether the focal lengths are exact; else they are sought anew.
     """
     over = _left_over(scene, used)
     if not (_is_most(over, used) and _is_most(over, used, at_sides(used, image_size))):
         return False
     rest, frames = used.select(over), len(scene.registered)
-    if any(has_parallax(pair, config) for pair in rank_pairs(rest, frames, intrinsics, config, known_focal=False)):
+    pairs = rank_pairs(rest, frames, intrinsics, config, known_focal=known_focal)
+    if any(has_parallax(pair, config) for pair in pairs):
         return False
     moved = [
         float(np.median(np.linalg.norm(seen.uv_second - seen.uv_first, axis=1)))
