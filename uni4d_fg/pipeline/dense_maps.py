@@ -196,7 +196,7 @@ class DenseMaps:
         if self.unmatched:
             return
         sound = [frame for frame in range(self.sequence.num_frames) if frame not in self.broken]
-        if not self.broken and not self._is_interpolated:
+        if not self.broken and not self.is_interpolated:
             middle = sound[len(sound) // 2]
             if adds_nothing(self._judged(middle, self.multiview.alone(middle)).errors):
                 self.unmatched = _ADDS_NOTHING
@@ -321,8 +321,7 @@ class DenseMaps:
         return stands_still(self.sequence.images[frame], mask, matched, static, seen)
 
     def _view(self, frame: int) -> View:
-        made = self._static(frame)
-        pose: FloatArray = self.scene["world_T_cam"][frame]
+        made, pose = self._static(frame), self.scene["world_T_cam"][frame]
         return View(made.color, made.inverse, made.static, pose, self._camera(frame))
 
     def landmarks_in(self, frame: int) -> tuple[FloatArray, FloatArray]:
@@ -423,7 +422,7 @@ class DenseMaps:
         log_z = log_scale_at + log_cue
         log_scale = float(self.scene["log_scale"][frame])
         errors = held_out_errors(cue, measured, uv, log_z, static, log_scale, self.config, share)
-        errors = errors._replace(telling=errors.telling and not self._is_interpolated)  # between these very ones
+        errors = errors._replace(telling=errors.telling and not self.is_interpolated)  # between these very ones
         return _Judged(cue, uv, log_z, share, unmasked, static, errors)
 
     def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
@@ -436,7 +435,7 @@ class DenseMaps:
         log_scale = float(self.scene["log_scale"][frame])
         return fuse_static(
             judged.cue, measured, known, judged.errors.cue, judged.static, like_moving, log_scale, self.bleeding_px,
-            self.config, frame in self.broken or self._is_interpolated,
+            self.config, frame in self.broken or self.is_interpolated,
         )  # fmt: skip
 
     def _bleeding(self, frame: int, judged: _Judged, measured: Measured) -> float:
@@ -450,7 +449,8 @@ class DenseMaps:
         return is_preferred(errors, self.bleeding_px, poor=self._cue_is_poor)
 
     @property
-    def _is_interpolated(self) -> bool:
+    def is_interpolated(self) -> bool:
+        """Whether the cue was interpolated between static points."""
         return self.sequence.depth_parallax is not None
 
     @property

@@ -35,7 +35,7 @@ def fused_frames(maps: DenseMaps, first: int, stop: int) -> Iterator[FusedFrame]
             frames = list(range(start, min(start + together, stop)))
             maps.prepare(frames, mapped)
             for frame, (depth, static) in zip(frames, mapped(maps.final, frames), strict=True):
-                told = ToldError()
+                told = ToldError(maps.is_interpolated)
                 if static is None:
                     yield FusedFrame(frame, depth, None, told)
                     continue

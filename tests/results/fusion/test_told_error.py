@@ -68,3 +68,18 @@ def test_without_static_pixels_no_error_is_told_and_without_landmarks_the_usual_
     assert told.mean() is None
     told.add(np.zeros(SHAPE, np.float32), np.ones(SHAPE, np.float32), everywhere, np.zeros((0, 2)), np.zeros(0))
     assert told.mean() == pytest.approx(0.0025)
+
+
+def test_depth_interpolated_between_points_is_farther_off_where_it_is_as_sure() -> None:
+    """Two thirds of the pixels are quite sure, a third hardly; landmarks lie on what is interpolated between them."""
+    sure, everywhere = np.full(SHAPE, 0.95, np.float32), np.ones(SHAPE, bool)
+    sure[:, : SHAPE[1] // 3] = 0.2
+    means = []
+    for from_motion in (False, True):
+        told = ToldError(from_motion)
+        places = np.argwhere(everywhere)[:: 7 if from_motion else SHAPE[0] * SHAPE[1], ::-1].astype(np.float64)
+        told.add(np.zeros(SHAPE, np.float32), sure, everywhere, places, np.zeros(len(places)))
+        means.append(told.mean())
+    part = (SHAPE[1] // 3) / SHAPE[1]
+    expected = [part * 0.05 + (1 - part) * 0.0045, part * 0.066 + (1 - part) * 0.018]
+    np.testing.assert_allclose(means, expected, rtol=1e-5)

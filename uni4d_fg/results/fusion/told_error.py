@@ -31,8 +31,10 @@ _BESIDE_WINDOW = np.ones((3, 3), np.uint8)
 _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
 _SURENESS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0], np.float32)
 _ERRORS = np.array([0.16, 0.05, 0.029, 0.0155, 0.0095, 0.0045, 0.0025], np.float32)
-"""Mean errors at these probabilities, linear in between: of clips of two renderers, from the video alone and with cues
-as networks make them."""
+"""Mean errors at these probabilities, linear in between: of clips of two renderers, with cues as networks make them."""
+_FROM_MOTION = np.array([0.125, 0.066, 0.049, 0.04, 0.025, 0.018, 0.007], np.float32)
+"""The same where the cue was interpolated between static points: medians of nine clips of a third renderer, and of two
+recordings."""
 _PRIOR_SHARE = 0.8
 """Of what is told, in the logarithm, that such errors have; the rest is the landmarks'."""
 _MIN_COMPARED = 10
@@ -78,6 +80,8 @@ def _bend(log_depth: Float32Array) -> Float32Array:
 class ToldError:
     """Collects, frame by frame, what the mean error of static depth is told from."""
 
+    from_motion: bool = False
+    """The cue was interpolated between static points: as sure a pixel is farther off, and landmarks say nothing."""
     pixels: FloatArray = field(default_factory=lambda: np.zeros(len(_BINS) + 1))
     """Number of static pixels by how sure they are."""
     expected: float = 0.0
@@ -101,7 +105,7 @@ class ToldError:
         sure = confidence[counted]
         above = [np.count_nonzero(sure >= np.float32(limit)) for limit in _BINS]
         self.pixels -= np.diff([len(sure), *above, 0])
-        self.expected += float(np.interp(sure, _SURENESS, _ERRORS).sum())
+        self.expected += float(np.interp(sure, _SURENESS, _FROM_MOTION if self.from_motion else _ERRORS).sum())
         column, row = np.rint(uv).astype(np.int64).T
         inside = (column >= 0) & (row >= 0) & (column < static.shape[1]) & (row < static.shape[0])
         inside[inside] = counted[row[inside], column[inside]]
@@ -125,7 +129,7 @@ class ToldError:
         prior = self.expected / total
         found = [np.concatenate(off) if off else np.zeros(0) for off in self.off]
         everywhere = np.concatenate(found)
-        if len(everywhere) < _MIN_COMPARED:
+        if self.from_motion or len(everywhere) < _MIN_COMPARED:
             return prior
         typical = [float(np.median(off if len(off) >= _MIN_COMPARED else everywhere)) for off in found]
         at_landmarks = float(self.pixels @ np.array(typical)) / total
