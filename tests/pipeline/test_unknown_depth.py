@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pipeline_scenes import SMALL, make_config, make_scene
 
 from uni4d_fg.pipeline import reconstruct
 from uni4d_fg.results.export.run import export_run
+from uni4d_fg.results.fusion.told_error import _FROM_MOTION, _SURENESS
 from uni4d_fg.results.report.certainty import certainty
 from uni4d_fg.results.run import Run
 
@@ -25,6 +27,11 @@ def test_a_run_its_report_and_its_exports_say_it(tmp_path: Path, saw_parallax: b
     assert ("depth_error" in summary.stages["fusion"]) is saw_parallax
     assert ("static depth is off by some" in facts) is saw_parallax
     run = Run(tmp_path / "run", lambda: sequence)
+    if saw_parallax:  # as far off as pixels that are so sure
+        still = np.stack([mask == 0 for mask in sequence.masks])
+        sure = np.load(run.folder.confidence)[still] / 255.0
+        usual = float(np.interp(sure, _SURENESS, _FROM_MOTION).mean())
+        assert summary.stages["fusion"]["depth_error"] == pytest.approx(usual, rel=0.05)
     assert ("Nothing is known of depth" in str(certainty(run))) is not saw_parallax
     (exported,) = export_run(run, ["colmap"], tmp_path / "exported")
     assert ("at an assumed distance" in " ".join(exported.warnings)) is not saw_parallax
