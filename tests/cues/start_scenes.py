@@ -44,6 +44,16 @@ def camera_path(num_frames: int, shift: tuple[float, ...], turn: tuple[float, ..
     return poses
 
 
+def observed(rows: list[tuple[np.ndarray, ...]]) -> Observations:
+    """Observations of what each frame sees: tracks, frames and pixels, sorted by track and frame, without depth."""
+    track, frame, uv = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    order = np.lexsort([frame, track])
+    return Observations(
+        track[order].astype(np.int64), frame[order].astype(np.int64), uv[order], np.full(len(order), np.nan),
+        np.ones(len(order)),
+    )  # fmt: skip
+
+
 def tracked(
     poses: np.ndarray,
     seed: int = 0,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cues.start_scenes import GUESS, SIZE, K, TrackedScene, sideways, tracked
+from cues.start_scenes import GUESS, SIZE, K, TrackedScene, observed, sideways, tracked
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure.growing import GrowingScene
@@ -45,13 +45,7 @@ def seated(seed: int) -> TrackedScene:
         uv = project(K, world_to_camera(pose, points)) + rng.normal(0, 0.15, (len(points), 2))
         seen = np.flatnonzero((uv > 0).all(axis=1) & (uv[:, 0] < SIZE[1]) & (uv[:, 1] < SIZE[0]))
         rows.append((seen, np.full(len(seen), frame), uv[seen]))
-    track, frame_of, uv = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    order = np.lexsort([frame_of, track])
-    observations = Observations(
-        track[order].astype(np.int64), frame_of[order].astype(np.int64), uv[order], np.full(len(order), np.nan),
-        np.ones(len(order)),
-    )  # fmt: skip
-    return TrackedScene(observations.with_min_observations(5), poses, np.arange(ROOM + BODY) >= ROOM)
+    return TrackedScene(observed(rows).with_min_observations(5), poses, np.arange(ROOM + BODY) >= ROOM)
 
 
 def solved(scene: TrackedScene, start: StartCameras | None = None) -> tuple[float, float, float, float]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from cues.start_scenes import GUESS, SIZE, K
+from cues.start_scenes import GUESS, SIZE, K, observed
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure import motion
@@ -59,13 +59,7 @@ def passing(seed: int, points: int = 800, sway: float = 0.11, turn: float = 0.06
         uv += rng.normal(0, 0.15, uv.shape)
         seen = np.flatnonzero((uv > 0).all(axis=1) & (uv[:, 0] < SIZE[1]) & (uv[:, 1] < SIZE[0]))
         rows.append((seen, np.full(len(seen), frame), uv[seen]))
-    track, frame_of, uv = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    order = np.lexsort([frame_of, track])
-    observations = Observations(
-        track[order].astype(np.int64), frame_of[order].astype(np.int64), uv[order], np.full(len(order), np.nan),
-        np.ones(len(order)),
-    )  # fmt: skip
-    return Street(observations.with_min_observations(5), poses, seen_from_bus)
+    return Street(observed(rows).with_min_observations(5), poses, seen_from_bus)
 
 
 def is_passing(street: Street, world_T_cam: np.ndarray, known_focal: bool = False) -> bool:

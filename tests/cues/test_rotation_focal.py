@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cues.start_scenes import SIZE
+from cues.start_scenes import SIZE, observed
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -34,10 +34,7 @@ def turning(focal: float, turns: np.ndarray, seed: int = 0, noise_px: float = 0.
         uv += rng.normal(0, noise_px, uv.shape)
         seen = np.flatnonzero((uv > 0).all(axis=1) & (uv[:, 0] < SIZE[1]) & (uv[:, 1] < SIZE[0]))
         rows.append((seen, np.full(len(seen), frame), uv[seen]))
-    track, frame_of, uv = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    order = np.lexsort([frame_of, track])
-    nothing = np.full(len(order), np.nan)
-    return Observations(track[order], frame_of[order], uv[order], nothing, np.ones(len(order))).with_min_observations(2)
+    return observed(rows).with_min_observations(2)
 
 
 def pan(degrees: float) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cues.start_scenes import SIZE, K, TrackedScene, sideways
+from cues.start_scenes import SIZE, K, TrackedScene, observed, sideways
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure.growing import GrowingScene
@@ -15,7 +15,6 @@ from uni4d_fg.cues.structure.trimming import trim
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.progress import SilentReporter
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
-from uni4d_fg.slam.stages.observations import Observations
 
 FRAMES, ROOM, BODY = 20, 220, 110
 NOISE_PX = 0.1
@@ -36,14 +35,7 @@ def swaying(seed: int, noise_px: float = NOISE_PX) -> TrackedScene:
         uv = project(K, world_to_camera(pose, points)) + rng.normal(0, noise_px, (ROOM + BODY, 2))
         seen = np.flatnonzero((uv > 0).all(axis=1) & (uv[:, 0] < SIZE[1]) & (uv[:, 1] < SIZE[0]))
         rows.append((seen, np.full(len(seen), frame), uv[seen]))
-    track, frame_of, uv = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    order = np.lexsort([frame_of, track])
-    count = len(track)
-    observations = Observations(
-        track[order].astype(np.int64), frame_of[order].astype(np.int64), uv[order], np.full(count, np.nan),
-        np.ones(count),
-    )  # fmt: skip
-    return TrackedScene(observations.with_min_observations(5), poses, np.arange(ROOM + BODY) >= ROOM)
+    return TrackedScene(observed(rows).with_min_observations(5), poses, np.arange(ROOM + BODY) >= ROOM)
 
 
 def solved(scene: TrackedScene, *changes: str) -> tuple[Structure, float, float]:
