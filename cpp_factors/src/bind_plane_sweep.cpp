@@ -25,7 +25,8 @@ FloatArray widened(const std::vector<float>& values, int height, int width) {
 
 std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> sweep(
     const AnyArray& image, const AnyArray& others, const AnyArray& turns, const AnyArray& shifts,
-    const AnyArray& inverse_depth, int radius, double noise, int small_step, int large_step, double edge_contrast,
+    const AnyArray& inverse_depth, int radius, double noise, double difference_share, double largest_difference,
+    int small_step, int large_step, double edge_contrast,
     int threads) {
   const View<double> reference = expect_floats(image, "image", {kAnyLength, kAnyLength}, false);
   const std::int64_t rows = reference.shape[0], columns = reference.shape[1];
@@ -43,9 +44,13 @@ std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> sweep(
   if (small_step < 0 || large_step < small_step || large_step > 1000)
     refuse("small_step, large_step: expected 0 <= small_step <= large_step <= 1000");
   if (!(noise > 0.0) || !(edge_contrast > 0.0)) refuse("noise, edge_contrast: expected positive numbers");
+  if (!(difference_share >= 0.0 && difference_share <= 1.0)) refuse("difference_share: expected 0 to 1");
+  if (!(largest_difference > 0.0)) refuse("largest_difference: expected a positive number");
   SweepOptions options;
   options.radius = radius;
   options.noise = static_cast<float>(noise);
+  options.difference_share = static_cast<float>(difference_share);
+  options.largest_difference = static_cast<float>(largest_difference);
   options.small_step = small_step;
   options.large_step = large_step;
   options.edge_contrast = static_cast<float>(edge_contrast);
@@ -70,7 +75,8 @@ std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> sweep(
 
 void bind_plane_sweep(nb::module_& module) {
   module.def("plane_sweep", &sweep, nb::arg("image"), nb::arg("others"), nb::arg("turns"), nb::arg("shifts"),
-             nb::arg("inverse_depth"), nb::kw_only(), nb::arg("radius"), nb::arg("noise"), nb::arg("small_step"),
+             nb::arg("inverse_depth"), nb::kw_only(), nb::arg("radius"), nb::arg("noise"), nb::arg("difference_share"),
+             nb::arg("largest_difference"), nb::arg("small_step"),
              nb::arg("large_step"), nb::arg("edge_contrast"), nb::arg("threads") = 0,
              "Multi-view depth of an image (H, W) from others (V, H, W), NaN where nothing is to be matched, that see "
              "its pixel x at inverse depth rho at turns (V, 3, 3) x + rho shifts (V, 3). Returns, (H, W) each: the "

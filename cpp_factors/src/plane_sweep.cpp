@@ -16,10 +16,11 @@ constexpr int kUnknown = 128;  // matching cost where nothing is known: halfway 
 constexpr int kNoViewYet = 255;
 constexpr int kBandRows = 40;
 constexpr int kChunk = 128;  // pixels of a row that are worked on together
+constexpr int kNarrow = 1;   // half side of the window over which gray values are compared themselves
 
 /// What the matching of a band of rows works in.
 struct Band {
-  std::vector<float> warped, seen, sum_w, sum_ww, sum_rw;
+  std::vector<float> warped, seen, sum_w, sum_ww, sum_rw, sum_ad;
   std::vector<std::uint8_t> first, second;
 };
 
@@ -68,17 +69,41 @@ UNI4D_FG_CLONES void sum_rows(const float* __restrict warped, const float* __res
   }
 }
 
-/// Sums over (2 radius + 1) rows of what `sum_rows` gave, and from them the matching cost of one row.
-UNI4D_FG_CLONES void match_row(const float* const* w, const float* const* ww, const float* const* rw, int rows,
-                               int width, int radius, const float* __restrict mean, const float* __restrict variance,
-                               const float* __restrict seen, float noise2, std::uint8_t* __restrict out) {
-  const float share = 1.0F / static_cast<float>((2 * radius + 1) * (2 * radius + 1));
+/// Sum (2 kNarrow + 1) neighbors of the differences between two rows, each at most `largest`.
+UNI4D_FG_CLONES void sum_differences(const float* __restrict warped, const float* __restrict reference, int width,
+                                     float largest, float* __restrict sum) {
+  for (int x = 0; x < width; ++x) sum[x] = 0.0F;
+  for (int k = -kNarrow; k <= kNarrow; ++k) {
+    const int begin = std::max(0, -k), end = std::min(width, width - k);
+    for (int x = begin; x < end; ++x) {
+      const float difference = std::abs(warped[x + k] - reference[x + k]);
+      sum[x] += difference < largest ? difference : largest;
+    }
+  }
+}
+
+/// What the cost of a row is made of: sums of rows, and how they count.
+struct RowSums {
+  const float *w[16], *ww[16], *rw[16];  // (2 radius + 1) rows of what `sum_rows` gave
+  const float* ad[2 * kNarrow + 1];      // and of what `sum_differences` gave
+};
+
+/// The matching cost of one row.
+UNI4D_FG_CLONES void match_row(const RowSums& sums, int width, const SweepOptions& options,
+                               const float* __restrict mean, const float* __restrict variance,
+                               const float* __restrict seen, std::uint8_t* __restrict out) {
+  const int radius = options.radius, rows = 2 * radius + 1;
+  const float share = 1.0F / static_cast<float>(rows * rows), noise2 = options.noise * options.noise;
+  const float of_difference =
+      options.difference_share * 255.0F / (options.largest_difference * static_cast<float>((2 * kNarrow + 1) * (2 * kNarrow + 1)));
+  const float of_correlation = 1.0F - options.difference_share;
   // In separate loops per chunk: each of them becomes SIMD, which one loop over all of it does not.
-  float a[kChunk], b[kChunk], c[kChunk], cost[kChunk];
+  float a[kChunk], b[kChunk], c[kChunk], e[kChunk], cost[kChunk];
   for (int begin = 0; begin < width; begin += kChunk) {
     const int count = std::min(kChunk, width - begin);
     for (int k = 0; k < rows; ++k) {
-      const float *__restrict wk = w[k] + begin, *__restrict wwk = ww[k] + begin, *__restrict rwk = rw[k] + begin;
+      const float *__restrict wk = sums.w[k] + begin, *__restrict wwk = sums.ww[k] + begin,
+                  *__restrict rwk = sums.rw[k] + begin;
       if (k == 0) std::fill_n(a, count, 0.0F), std::fill_n(b, count, 0.0F), std::fill_n(c, count, 0.0F);
       for (int i = 0; i < count; ++i) {
         a[i] += wk[i];
@@ -86,13 +111,17 @@ UNI4D_FG_CLONES void match_row(const float* const* w, const float* const* ww, co
         c[i] += rwk[i];
       }
     }
+    std::fill_n(e, count, 0.0F);
+    for (const float* row : sums.ad) {
+      const float* __restrict ad = row + begin;
+      for (int i = 0; i < count; ++i) e[i] += ad[i];
+    }
     for (int i = 0; i < count; ++i) {
       const float sum = a[i] * share, other = b[i] * share - sum * sum;
       const float spread = other > 0.0F ? other : 0.0F;
       const float zncc = (c[i] * share - sum * mean[begin + i]) / std::sqrt((variance[begin + i] + noise2) * (spread + noise2));
-      const float exact = (1.0F - zncc) * 127.5F + 0.5F;
-      const float low = exact > 0.0F ? exact : 0.0F;
-      const float bounded = low < 255.0F ? low : 255.0F;
+      const float unlike = (1.0F - zncc) * 127.5F, low = unlike > 0.0F ? unlike : 0.0F;
+      const float bounded = of_correlation * (low < 255.0F ? low : 255.0F) + of_difference * e[i] + 0.5F;
       const int x = begin + i;
       const bool known = (seen[x] > 0.0F) & (x >= radius) & (x < width - radius) & (variance[x] >= 0.0F);
       cost[i] = known ? bounded : static_cast<float>(kUnknown);
@@ -126,7 +155,7 @@ class Matching {
     const int radius = options_.radius, width = width_, depth = static_cast<int>(planes_.size());
     const int top = std::max(0, begin - radius), low = std::min(height_, end + radius), rows = low - top;
     const auto cells = static_cast<std::size_t>(rows) * static_cast<std::size_t>(width);
-    for (auto* buffer : {&work.warped, &work.seen, &work.sum_w, &work.sum_ww, &work.sum_rw}) buffer->resize(cells);
+    for (auto* buffer : {&work.warped, &work.seen, &work.sum_w, &work.sum_ww, &work.sum_rw, &work.sum_ad}) buffer->resize(cells);
     const auto out_cells = static_cast<std::size_t>(end - begin) * static_cast<std::size_t>(width);
     work.first.resize(out_cells);
     work.second.resize(out_cells);
@@ -142,21 +171,23 @@ class Matching {
                    &work.warped[at], &work.seen[at]);
           sum_rows(&work.warped[at], &image_[offset(y)], width, radius, &work.sum_w[at], &work.sum_ww[at],
                    &work.sum_rw[at]);
+          sum_differences(&work.warped[at], &image_[offset(y)], width, options_.largest_difference, &work.sum_ad[at]);
         }
         for (int y = begin; y < end; ++y) {
           const std::size_t to = offset(y - begin);
           if (y < radius || y >= height_ - radius) {
             std::fill(line.begin(), line.end(), static_cast<std::uint8_t>(kUnknown));
           } else {
-            const float *w[16], *ww[16], *rw[16];
+            RowSums sums;
             for (int k = 0; k <= 2 * radius; ++k) {
               const std::size_t from = offset(y - radius + k - top);
-              w[k] = &work.sum_w[from];
-              ww[k] = &work.sum_ww[from];
-              rw[k] = &work.sum_rw[from];
+              sums.w[k] = &work.sum_w[from];
+              sums.ww[k] = &work.sum_ww[from];
+              sums.rw[k] = &work.sum_rw[from];
             }
-            match_row(w, ww, rw, 2 * radius + 1, width, radius, &mean_[offset(y)], &variance_[offset(y)],
-                      &work.seen[offset(y - top)], options_.noise * options_.noise, line.data());
+            for (int k = 0; k <= 2 * kNarrow; ++k) sums.ad[k] = &work.sum_ad[offset(y - kNarrow + k - top)];
+            match_row(sums, width, options_, &mean_[offset(y)], &variance_[offset(y)], &work.seen[offset(y - top)],
+                      line.data());
           }
           keep_two(line.data(), width, &work.first[to], &work.second[to]);
         }

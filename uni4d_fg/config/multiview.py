@@ -30,6 +30,13 @@ class MultiviewConfig(Section):
     image_noise: float = setting(
         0.01, "Standard deviation of the noise of gray values, of 1: weaker texture says nothing.", gt=0, lt=1
     )
+    difference_share: float = setting(
+        0.4,
+        "Part of the cost that differences of gray values are, beside the correlation: they keep edges.",
+        ge=0,
+        le=1,
+    )
+    largest_difference: float = setting(0.1, "Larger differences of gray values, of 1, are all alike.", gt=0, le=1)
     small_step_penalty: int = setting(6, "Cost (of 255) of a neighbor that is one plane away.", ge=0, le=255)
     large_step_penalty: int = setting(100, "Cost of one that is farther away, where the image is flat.", ge=0, le=1000)
     edge_contrast: float = setting(0.03, "A difference between gray values, of 1, that halves that cost.", gt=0)

@@ -13,7 +13,15 @@ from uni4d_fg.results.fusion.multiview.sweep_numpy import sweep_numpy
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 80.0
 K = np.array([FOCAL, FOCAL, 39.5, 29.5])
-SETTINGS = {"radius": 2, "noise": 0.01, "small_step": 6, "large_step": 100, "edge_contrast": 0.03}
+SETTINGS = {
+    "radius": 2,
+    "noise": 0.01,
+    "difference_share": 0.4,
+    "largest_difference": 0.1,
+    "small_step": 6,
+    "large_step": 100,
+    "edge_contrast": 0.03,
+}
 
 
 def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -60,6 +68,27 @@ def test_depth_of_a_known_scene(motion: str) -> None:
     bound = 0.01 if motion == "sideways" else 0.03  # forward, the middle of the image does not move
     assert np.median(error) < bound
     assert np.mean(error < 0.05) > (0.9 if motion == "sideways" else 0.65)
+
+
+def test_differences_of_gray_values_keep_edges(rng: np.random.Generator) -> None:
+    """Beside a thing in front of a wall of little contrast, windows say only where the thing is."""
+    steps = [at(0.25), at(-0.25), at(0.0, 0.25), at(0.0, -0.25)]
+
+    def seen(pose: np.ndarray) -> np.ndarray:
+        image, depth = view(pose)
+        weak = np.where(depth < 1.7, image, 0.4 + 0.3 * (image - 0.5))
+        return np.asarray(weak + 0.003 * rng.standard_normal(image.shape), np.float32)
+
+    image, truth = seen(at(0.0)), view(at(0.0))[1]
+    board = (truth < 1.7).astype(np.uint8)
+    beside = (cv2.dilate(board, np.ones((7, 7), np.uint8)) > 0) & (board == 0)
+    others, poses, planes = [seen(p) for p in steps], [np.linalg.inv(p) for p in steps], np.linspace(0.2, 0.8, 48)
+    nearer = []
+    for share in (0.0, 0.4):
+        config = MultiviewConfig(difference_share=share)
+        found = 1.0 / sweep(image, others, poses, K, planes, config).inverse_depth
+        nearer.append(float(np.mean(found[beside] < 2.0)))
+    assert nearer[1] < 0.6 * nearer[0]
 
 
 def test_what_is_marked_moving_is_not_matched() -> None:

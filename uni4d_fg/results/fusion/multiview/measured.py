@@ -12,6 +12,7 @@ from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.results.fusion.averaging import average_over_frames
 from uni4d_fg.results.fusion.multiview.confidence import Evidence, confidence, relative_sigma
+from uni4d_fg.results.fusion.multiview.exposure import Shown, exposures
 from uni4d_fg.results.fusion.multiview.planes import choose_planes
 from uni4d_fg.results.fusion.multiview.sweep import sweep
 from uni4d_fg.results.fusion.multiview.views import choose_views
@@ -110,11 +111,11 @@ class MultiviewDepth:
         other_T_cam = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
         intrinsics = self.size.intrinsics(self.intrinsics)
         planes = choose_planes(z, other_T_cam, intrinsics, (self.size.height, self.size.width), self.config)
-        image = self._shown(frame).gray
-        swept = sweep(
-            image, [self._shown(view).matched for view in views], other_T_cam, intrinsics, planes, self.config,
-            self.threads,
-        )  # fmt: skip
+        own = self._shown(frame)
+        others = [Shown(self._shown(view).matched, self.world_T_cam[view]) for view in views]
+        factors = exposures(Shown(own.matched, pose), others, points, intrinsics)
+        matched = [other.gray * np.float32(factor) for other, factor in zip(others, factors, strict=True)]
+        swept = sweep(own.gray, matched, other_T_cam, intrinsics, planes, self.config, self.threads)
         step = np.float32(planes[1] - planes[0])
         return _Raw(
             self.size.continued(swept.inverse_depth), Evidence.of(swept, step / swept.inverse_depth, len(views))

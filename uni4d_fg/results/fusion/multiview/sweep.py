@@ -54,6 +54,8 @@ def sweep(
     settings: dict[str, Any] = {
         "radius": config.window_radius_px,
         "noise": config.image_noise,
+        "difference_share": config.difference_share,
+        "largest_difference": config.largest_difference,
         "small_step": config.small_step_penalty,
         "large_step": config.large_step_penalty,
         "edge_contrast": config.edge_contrast,

@@ -1,9 +1,11 @@
 """The plane sweep of ``cpp_factors/src/plane_sweep.cpp`` in NumPy: what it must give, and what runs without it.
 
 For every plane, each other image is warped onto the reference and compared by normalized cross-correlation over a
-window; of more than two images the two that match best count, so that a pixel which some do not see is still found.
-Costs are whole numbers: (1 - correlation) 127.5, 128 where nothing is known. Semi-global matching sums them along
-eight paths (Hirschmueller 2008), with a penalty for a change of plane that is lower across edges of the image.
+window, and by differences of gray values over a smaller one, which keep edges; of more than two images the two that
+match best count, so that a pixel which some do not see is still found. Costs are whole numbers up to 255, weighted
+means of (1 - correlation) 127.5 and of the difference over its largest one; 128 where nothing is known. Semi-global
+matching sums them along eight paths (Hirschmueller 2008), with a penalty for a change of plane that is lower across
+edges of the image.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ import numpy.typing as npt
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 
 _UNKNOWN = 128
+_NARROW = 1
+"""Half side of the window over which gray values are compared themselves, px."""
 
 
 def sweep_numpy(
@@ -25,6 +29,8 @@ def sweep_numpy(
     *,
     radius: int,
     noise: float,
+    difference_share: float,
+    largest_difference: float,
     small_step: int,
     large_step: int,
     edge_contrast: float,
@@ -39,6 +45,8 @@ def sweep_numpy(
         planes: (D,) inverse depths.
         radius: Half side of the window, px.
         noise: Standard deviation of the images' noise.
+        difference_share: Part of the cost that differences of gray values are.
+        largest_difference: Larger ones are all alike.
         small_step: Penalty of a change by one plane.
         large_step: Penalty of a larger change where the image is flat.
         edge_contrast: Difference between pixels that halves it.
@@ -47,7 +55,10 @@ def sweep_numpy(
         The best plane as a number between them, its aggregated cost, that of the best plane elsewhere, and the
         matching cost, (h, w) each.
     """
-    costs = _matching_costs(image.astype(np.float32), others.astype(np.float32), turns, shifts, planes, radius, noise)
+    costs = _matching_costs(
+        image.astype(np.float32), others.astype(np.float32), turns, shifts, planes, radius, noise,
+        np.float32(difference_share), np.float32(largest_difference),
+    )  # fmt: skip
     total = np.zeros(costs.shape, np.int32)
     for step in ((0, 1), (1, -1), (1, 0), (1, 1)):
         for sign in (1, -1):
@@ -57,7 +68,7 @@ def sweep_numpy(
 
 def _matching_costs(
     image: Float32Array, others: Float32Array, turns: FloatArray, shifts: FloatArray, planes: FloatArray,
-    radius: int, noise: float,
+    radius: int, noise: float, difference_share: np.float32, largest_difference: np.float32,
 ) -> Int32Array:  # fmt: skip
     """Return costs (h, w, D)."""
     height, width = image.shape
@@ -77,7 +88,10 @@ def _matching_costs(
             spread = np.maximum(_window_mean(warped * warped, radius) - there * there, 0)
             both = _window_mean(warped * reference, radius) - there * mean
             zncc = both / np.sqrt((variance + noise2) * (spread + noise2))
-            cost = np.clip((1 - zncc) * np.float32(127.5) + np.float32(0.5), 0, 255).astype(np.int32)
+            unlike = np.clip((1 - zncc) * np.float32(127.5), 0, 255)
+            differing = _window_mean(np.minimum(np.abs(warped - reference), largest_difference), _NARROW)
+            differing *= np.float32(255) / largest_difference
+            cost = ((1 - difference_share) * unlike + difference_share * differing + np.float32(0.5)).astype(np.int32)
             found.append(np.where(known & seen, cost, _UNKNOWN))
         ordered = np.sort(np.stack(found), axis=0)
         costs[..., index] = (ordered[0] + ordered[1] + 1) // 2 if len(found) > 2 else ordered[0]
