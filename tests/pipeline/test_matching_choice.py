@@ -24,9 +24,9 @@ def test_a_poor_cue_bleeds_and_is_matched_unless_far_worse() -> None:
         False,
         False,
     ]
-    assert bleeding_of([1.0, np.nan], poor=False) == 0.0
-    assert bleeding_of([5.0, 9.0, np.nan], poor=False) == 7.0
-    sharp, poor = bleeding_of([], poor=False), bleeding_of([], poor=True)
+    assert bleeding_of(1.0, poor=False) == 0.0
+    assert bleeding_of(7.0, poor=False) == 7.0
+    sharp, poor = bleeding_of(np.nan, poor=False), bleeding_of(np.nan, poor=True)
     assert sharp == 0.0
     assert poor == 6.0
     for ratio, of_poor, of_other in ((0.9, True, True), (2.0, True, False), (3.5, False, False)):

@@ -15,7 +15,7 @@ from uni4d_fg.optim.threads import OrderedMap
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.fusion.averaging import Averaged, average_over_frames, chosen_by_others
 from uni4d_fg.results.fusion.background import Background, View, background
-from uni4d_fg.results.fusion.bleeding import bleeding_radius
+from uni4d_fg.results.fusion.bleeding import EdgeProfile, bleeding_radius, edge_profile
 from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
 from uni4d_fg.results.fusion.guided_median import guided_median
@@ -24,12 +24,7 @@ from uni4d_fg.results.fusion.mask_band import STILL, looks_moving, stands_still
 from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_poor, is_preferred, tells_bleeding
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
-from uni4d_fg.results.fusion.multiview.working_frame import (
-    WorkingFrame,
-    WorkingSize,
-    without_band,
-    working_frame,
-)
+from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize, without_band, working_frame
 from uni4d_fg.results.fusion.static_depth import (
     HeldOut,
     StaticDepth,
@@ -201,14 +196,15 @@ class DenseMaps:
             if adds_nothing(self._judged(middle, self.multiview.alone(middle)).errors):
                 self.unmatched = _ADDS_NOTHING
                 return
-        tried, bled = list[HeldOut](), list[float]()
+        tried, edges = list[HeldOut](), list[EdgeProfile | None]()
         for at in evenly_spread(len(sound), _TRIED_FRAMES).tolist():
             measured = self.multiview.at(sound[at])
             judged = self._judged(sound[at], measured)
             tried.append(judged.errors)
             if measured is not None and tells_bleeding(judged.errors):
-                bled.append(self._bleeding(sound[at], judged, measured))
-        self.bleeding_px = bleeding_of(bled, poor=self._cue_is_poor)
+                edges.append(self._edge_profile(sound[at], judged, measured))
+        bleeding_px = bleeding_radius([profile for profile in edges if profile is not None])
+        self.bleeding_px = bleeding_of(bleeding_px, poor=self._cue_is_poor)
         # One choice for the whole video: between frames that are matched and others that are not, surfaces would jump.
         preferred = [self._prefers(errors) for errors in tried]
         self.prefers_matching = 2 * sum(preferred) > len(preferred)
@@ -438,11 +434,11 @@ class DenseMaps:
             self.config, frame in self.broken or self.is_interpolated,
         )  # fmt: skip
 
-    def _bleeding(self, frame: int, judged: _Judged, measured: Measured) -> float:
-        """Return how far the cue of a frame bleeds, working px; NaN if the frame does not tell."""
+    def _edge_profile(self, frame: int, judged: _Judged, measured: Measured) -> EdgeProfile | None:
+        """Return how the cue of a frame differs from matched depth beside edges; None if there are none."""
         corrected = self._fused(frame, judged, measured).corrected
         sure = judged.static & (measured.confidence > _SURE)
-        return bleeding_radius(corrected.affine(judged.cue), measured.log_depth, sure)
+        return edge_profile(corrected.affine(judged.cue), measured.log_depth, sure)
 
     def _prefers(self, errors: HeldOut) -> bool:
         """Tell whether matched depth is the better one, as far as a frame says; once it is known whether cues bleed."""

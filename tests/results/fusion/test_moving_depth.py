@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.results.fusion.bleeding import bleeding_radius
+from uni4d_fg.results.fusion.bleeding import bleeding_radius, edge_profile
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 
 HEIGHT, WIDTH = 120, 160
@@ -50,9 +50,11 @@ def test_the_reach_of_bleeding_is_measured_through_a_smooth_error(blur_px: int) 
     _, truth, bled = scene(blur_px)
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
     smooth = (0.08 * np.sin(u / 25) * np.cos(v / 20)).astype(np.float32)
-    radius = bleeding_radius(bled + smooth, truth, np.ones(truth.shape, bool))
-    assert abs(radius - blur_px) <= 3
-    assert np.isnan(bleeding_radius(bled, np.full_like(truth, FAR), np.ones(truth.shape, bool)))
+    profile = edge_profile(bled + smooth, truth, np.ones(truth.shape, bool))
+    assert profile is not None
+    assert abs(bleeding_radius([profile, profile]) - blur_px) <= 1.5
+    assert edge_profile(bled, np.full_like(truth, FAR), np.ones(truth.shape, bool)) is None
+    assert np.isnan(bleeding_radius([]))
 
 
 def test_a_frame_without_a_cue_takes_an_instance_from_the_frames_beside(rng: np.random.Generator) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.results.fusion.log_range import log_range
 from uni4d_fg.results.nearest import from_nearest
 
@@ -13,8 +16,8 @@ _EDGE = 0.15
 """Change of log depth over two pixels that is an edge."""
 _LONGEST = 0.09
 """Bleeding reaches no farther than this part of the width."""
-_ENDS = 0.15
-"""It ends where it is this part of what it is beside the edge."""
+_LOW, _TO_ITS_END = 0.4, 1.7
+"""Where it is the first part of what it is beside the edge is told well; it ends this many times as far away."""
 _LEAST = 0.02
 """Less beside the edge is none."""
 _MIN_PIXELS = 30
@@ -30,11 +33,18 @@ _RAMP = 0.25
 """Change of log depth across which a cue that bleeds is a mixture."""
 
 
-def bleeding_radius(log_cue: Float32Array, log_depth: Float32Array, sure: BoolArray) -> float:
-    """Measure how far a cue bleeds across depth edges.
+@dataclass(frozen=True)
+class EdgeProfile:
+    """How a cue and the true depth differ beside the depth edges of a frame, by the distance from them, working px."""
 
-    Bleeding makes what is near beside an edge too far, and what is far too near; other errors do not know which is
-    which, and cancel in the mean over the edges of a frame.
+    count: FloatArray
+    """(D,) pixels at a distance of 0 to D - 1 px."""
+    total: FloatArray
+    """(D,) log depth by which what is near is too far in them, and what is far too near, summed."""
+
+
+def edge_profile(log_cue: Float32Array, log_depth: Float32Array, sure: BoolArray) -> EdgeProfile | None:
+    """Measure a cue beside depth edges.
 
     Args:
         log_cue: (h, w) affinely corrected, NaN where missing.
@@ -42,11 +52,11 @@ def bleeding_radius(log_cue: Float32Array, log_depth: Float32Array, sure: BoolAr
         sure: (h, w) where that is to be believed.
 
     Returns:
-        Working px, 0 if it does not bleed; NaN if the frame has no edges that tell.
+        The profile; None if the frame has no edges.
     """
     edge = (log_range(log_depth, np.ones((3, 3), np.uint8)) > _EDGE) & sure
     if not edge.any():
-        return float("nan")
+        return None
     distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 3)
     reach = max(3, round(_LONGEST * log_cue.shape[1]))
     around = cv2.blur(log_depth, (2 * reach + 1,) * 2)
@@ -55,14 +65,30 @@ def bleeding_radius(log_cue: Float32Array, log_depth: Float32Array, sure: BoolAr
     bins = np.minimum(distance[usable], reach).astype(np.int64)
     count = np.bincount(bins, minlength=reach + 1)[:reach]
     total = np.bincount(bins, inwards[usable], minlength=reach + 1)[:reach]
-    if (count < _MIN_PIXELS).any():
+    return EdgeProfile(count.astype(np.float64), np.asarray(total, dtype=np.float64))
+
+
+def bleeding_radius(profiles: Sequence[EdgeProfile]) -> float:
+    """Measure how far a cue bleeds across depth edges, from the profiles of some frames.
+
+    Bleeding makes what is near beside an edge too far, and what is far too near; other errors do not know which is
+    which, and cancel in the mean over the edges of the frames. What does not, lies above the profile's far half, too.
+
+    Returns:
+        Working px, 0 if it does not bleed; NaN if the frames have too few edges to tell.
+    """
+    count, total = (np.sum([getattr(p, name) for p in profiles], axis=0) for name in ("count", "total"))
+    if not profiles or (count < _MIN_PIXELS).any():
         return float("nan")
     profile = total / count
-    peak = float(profile[:3].max())
-    if peak < _LEAST:
+    profile -= np.median(profile[len(profile) // 2 :])
+    top = int(np.argmax(profile[:3]))
+    if profile[top] < _LEAST:
         return 0.0
-    below = np.flatnonzero(profile < max(_ENDS * peak, 0.5 * _LEAST))
-    return float(below[0] if len(below) else reach)
+    low = _LOW * profile[top]
+    first = top + int(np.argmax(profile[top:] < low))  # there is one: half of the far half is below 0
+    before = profile[first - 1]
+    return float(_TO_ITS_END * (first - 1 + (before - low) / (before - profile[first])))
 
 
 def across_edges(log_cue: Float32Array, radius_px: float) -> BoolArray:

@@ -45,17 +45,14 @@ def tells_bleeding(errors: HeldOut) -> bool:
     return _counts(errors, _NOT_WORSE, bleeds=True)
 
 
-def bleeding_of(radii: list[float], *, poor: bool) -> float:
+def bleeding_of(radius: float, *, poor: bool) -> float:
     """Return how far a cue bleeds, working px; 0 for one that has the detail of edges.
 
     Args:
-        radii: Of the frames that tell; NaN for those that do not.
+        radius: As edges tell, working px; NaN if they do not.
         poor: See :func:`is_poor`.
     """
-    known = [radius for radius in radii if np.isfinite(radius)]
-    radius = float(np.median(known)) if known else 0.0
-    if poor:
-        radius = max(radius, _POOR_BLEEDS_PX)
+    radius = max(radius if np.isfinite(radius) else 0.0, _POOR_BLEEDS_PX if poor else 0.0)
     return radius if radius > _SHARP_PX else 0.0
 
 
