@@ -137,6 +137,21 @@ def test_cut_short(tmp_path: Path, codec: str, suffix: str, keep: float) -> None
         VideoFrames(path)
 
 
+@pytest.mark.parametrize(("codec", "suffix"), CONTAINERS[:3])
+def test_damage_in_the_middle(tmp_path: Path, codec: str, suffix: str) -> None:
+    """The decoder stops there as at an end: the frames before must not pass for the whole video."""
+    path = write_video(tmp_path / f"clip{suffix}", moving_frames(30), codec)
+    stored = bytearray(path.read_bytes())
+    middle, length = len(stored) // 2, len(stored) // 50
+    stored[middle : middle + length] = np.random.default_rng(0).bytes(length)
+    path.write_bytes(stored)
+    with pytest.raises(InputError, match=r"cannot be decoded, though others follow; .* before \d+$") as raised:
+        VideoFrames(path)
+    stop = int(str(raised.value).rsplit(" ", 1)[1])
+    assert 10 <= stop < 30
+    assert len(VideoFrames(path, stop=stop)) == stop
+
+
 def test_beginning_of_a_video_that_is_cut_short(tmp_path: Path) -> None:
     path = table_first(write_video(tmp_path / "clip.mp4", moving_frames(30)))
     whole = path.read_bytes()

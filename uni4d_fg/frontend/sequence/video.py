@@ -23,6 +23,8 @@ _CACHED_BYTES = 2**27  # when read backwards
 _STEP_BACK = 16  # frames; a longer step back is a jump
 _SEEK_MARGIN = 16  # frames
 _SAME_TIME = 1e-5  # seconds
+_PAST_DAMAGE = 32
+"""Attempts to go on where a frame cannot be decoded: at the end of a file none succeeds."""
 _REMEDY = "re-encode the video, or extract its frames into rgb/"
 
 
@@ -47,8 +49,8 @@ class VideoFrames(LazyFrames[ImageArray]):
             when the file has no such times.
 
     Raises:
-        InputError: If the file cannot be opened, is cut short or holds no frame, and on indexing if a frame
-            cannot be decoded.
+        InputError: If the file cannot be opened, is cut short, is damaged before its end or holds no frame, and on
+            indexing if a frame cannot be decoded.
     """
 
     def __init__(self, path: Path, stop: int | None = None) -> None:
@@ -118,6 +120,11 @@ class VideoFrames(LazyFrames[ImageArray]):
             times.append(1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
         if stop is None or len(times) < stop:
             self._check_complete(len(times))
+            if any(self._capture.grab() for _ in range(_PAST_DAMAGE)):
+                before = f", or select frames before {len(times)}" if len(times) > 1 else ""
+                raise SequenceProblem(
+                    self.where(len(times)), "cannot be decoded, though others follow", f"{_REMEDY}{before}"
+                )
         self._open()
         found = np.array(times)
         return len(found), found if np.isfinite(found).all() and (np.diff(found) > 0).all() else None
