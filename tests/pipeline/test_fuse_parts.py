@@ -21,8 +21,7 @@ from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import run_stage
 from uni4d_fg.pipeline import control, dense_maps, fuse, fuse_parts, reconstruct, run
-from uni4d_fg.pipeline.dense_maps import SomeControlPoints
-from uni4d_fg.results.fusion.densify import ControlPoints
+from uni4d_fg.results.fusion.densify import ControlPoints, SomeControlPoints
 from uni4d_fg.results.fusion.static_depth import HeldOut
 from uni4d_fg.results.run_folder import RunFolder
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, overload
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, at_nearest_pixel, evenly_spread
@@ -17,10 +18,10 @@ from uni4d_fg.results.fusion.averaging import Averaged, average_over_frames, cho
 from uni4d_fg.results.fusion.background import Background, View, background
 from uni4d_fg.results.fusion.bleeding import EdgeProfile, bleeding_radius, edge_profile
 from uni4d_fg.results.fusion.carried import carried_depth
-from uni4d_fg.results.fusion.densify import ControlPoints, densify_frame
+from uni4d_fg.results.fusion.densify import ControlPoints, SomeControlPoints, densify_frame
 from uni4d_fg.results.fusion.guided_median import guided_median
 from uni4d_fg.results.fusion.lifting import lifted
-from uni4d_fg.results.fusion.mask_band import STILL, looks_moving, stands_still
+from uni4d_fg.results.fusion.mask_band import FARTHEST_PX, STILL, FittedMask, fitted_mask, looks_moving
 from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_poor, is_preferred, tells_bleeding
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
@@ -46,7 +47,6 @@ _TRIED_FRAMES = 3
 """Frames that are matched first: where landmarks prefer the cue in all of them, no others are matched."""
 _SURE = 0.8
 """Matched depth of this confidence tells how far the cue bleeds."""
-_HALF = 0.5
 _BLED_SHARE = 2.0
 """Moving things take their depth from this many times as far inside as the cue bleeds in the mean."""
 _ADDS_NOTHING = "adds nothing to this cue, as landmarks say"
@@ -94,36 +94,6 @@ class _Judged(NamedTuple):
     static: BoolArray
     """(h, w) the same without a band around masks."""
     errors: HeldOut
-
-
-@dataclass(frozen=True)
-class SomeControlPoints(SequenceOf[ControlPoints]):
-    """Those of some frames, by the numbers of all."""
-
-    start: int
-    some: list[ControlPoints]
-    num_frames: int
-
-    @classmethod
-    def of(cls, control: SequenceOf[ControlPoints], start: int, stop: int) -> SomeControlPoints:
-        """Take those of frames ``start`` to ``stop - 1``, as far as there are any."""
-        start, stop = max(start, 0), min(stop, len(control))
-        return cls(start, [control[frame] for frame in range(start, stop)], len(control))
-
-    def __len__(self) -> int:
-        return self.num_frames
-
-    @overload
-    def __getitem__(self, frame: int) -> ControlPoints: ...
-    @overload
-    def __getitem__(self, frame: slice) -> list[ControlPoints]: ...
-    def __getitem__(self, frame: int | slice) -> ControlPoints | list[ControlPoints]:
-        """Return those of a frame. Raises IndexError where they were left out."""
-        if isinstance(frame, slice):
-            return [self[number] for number in range(*frame.indices(self.num_frames))]
-        if not 0 <= frame - self.start < len(self.some):
-            raise IndexError(f"control points of frame {frame} were left out")
-        return self.some[frame - self.start]
 
 
 @dataclass
@@ -250,15 +220,16 @@ class DenseMaps:
         mine = self._static(frame)
         averaged = self._averaged(frame)
         averaged = averaged._replace(log_depth=self.size.continued(averaged.log_depth))
-        filled, still = averaged.log_depth, None
+        filled, moving, unmasked = averaged.log_depth, mask, mine.unmasked
         if self.prefers_matching and (mask > 0).any():
-            # Masks reach beyond what moves: what other frames see there just the same stands still.
             behind = self._behind(frame)
-            still = self._still(frame, mask, behind)
-            shown = self.size.straight(still) & behind.seen & ~mine.unmasked
+            fitted = self._fitted(frame, mask, behind)
+            shown = self.size.straight(fitted.still) & behind.seen & ~mine.unmasked
             filled = np.where(shown, -np.log(np.where(shown, behind.inverse, np.float32(1))), filled)
+            unmasked = unmasked & ~self.size.straight(fitted.missed)
+            moving = fitted.applied(mask, self.size.plain)
         sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
-        sure[~mine.unmasked & (mine.depth.matched <= STILL)] = 0
+        sure[~unmasked & (mine.depth.matched <= STILL)] = 0
         log_depth, sure = self.size.shown(filled), self.size.shown(self.size.continued(sure))
         if frame in self.broken or self.bleeding_px:
             log_depth = guided_median(log_depth, sure, self.size.shown(mine.static), self.sequence.images[frame])
@@ -266,12 +237,9 @@ class DenseMaps:
             full[np.isnan(given)] = np.nan
         else:
             full = lifted(filled, self.size.continued(mine.log_cue), given, self.size)
-        moving = mask > 0
-        if moving.any():
-            if still is not None:
-                moving &= self.size.plain.enlarge(still.astype(np.float32)) <= _HALF
-            full[moving] = np.exp(self._moving(frame, given, mask)[moving])
-        return full, FinalStatic(log_depth, sure, self.size.shown(mine.unmasked))
+        if (moving > 0).any():
+            full[moving > 0] = np.exp(self._moving(frame, given, moving)[moving > 0])
+        return full, FinalStatic(log_depth, sure, self.size.shown(unmasked))
 
     def _averaged(self, frame: int) -> Averaged:
         """Average a frame's static depth with that of the frames near it.
@@ -302,19 +270,21 @@ class DenseMaps:
         return [number for number in near if 0 <= number < self.sequence.num_frames]
 
     def _behind(self, frame: int) -> Background:
-        """Return what frames near one show of the still scene where it has masks."""
+        """Return what frames near one show of the still scene where it has masks, and around them."""
         # The frames next to it mostly have their masks in the same place.
         near = [number for number in self._near(frame) if abs(number - frame) > 1] or self._near(frame)
         masked = self.size.within(~self._static(frame).unmasked, False)
-        return background(self._view(frame), map(self._view, near), masked)
+        side = 2 * FARTHEST_PX + 1
+        around = cv2.dilate(masked.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        return background(self._view(frame), map(self._view, near), around)
 
-    def _still(self, frame: int, mask: Int32Array, behind: Background) -> BoolArray:
-        """Return which pixels inside masks stand still, as the shrunk image shows them."""
+    def _fitted(self, frame: int, mask: Int32Array, behind: Background) -> FittedMask:
+        """Return where a mask is too large and where too small, as the shrunk image shows it."""
         mine = self._static(frame)
         matched, static = self.size.shown(mine.depth.matched), self.size.shown(mine.static)
         color, variance, inverse = (self.size.shown(part) for part in behind[:3])
         seen = Background(color, variance, inverse, self.size.shown(behind.seen))
-        return stands_still(self.sequence.images[frame], mask, matched, static, seen)
+        return fitted_mask(self.sequence.images[frame], mask, matched, static, seen)
 
     def _view(self, frame: int) -> View:
         made, pose = self._static(frame), self.scene["world_T_cam"][frame]

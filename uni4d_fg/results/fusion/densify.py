@@ -13,7 +13,9 @@ control points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import cv2
 import numpy as np
@@ -42,6 +44,36 @@ class ControlPoints:
     """(N, 3) world, m."""
     share: FloatArray | None = None
     """(N,) part of its weight that each point has, 0 to 1; None gives all their whole weight."""
+
+
+@dataclass(frozen=True)
+class SomeControlPoints(Sequence[ControlPoints]):
+    """Those of some frames, by the numbers of all."""
+
+    start: int
+    some: list[ControlPoints]
+    num_frames: int
+
+    @classmethod
+    def of(cls, control: Sequence[ControlPoints], start: int, stop: int) -> SomeControlPoints:
+        """Take those of frames ``start`` to ``stop - 1``, as far as there are any."""
+        start, stop = max(start, 0), min(stop, len(control))
+        return cls(start, [control[frame] for frame in range(start, stop)], len(control))
+
+    def __len__(self) -> int:
+        return self.num_frames
+
+    @overload
+    def __getitem__(self, frame: int) -> ControlPoints: ...
+    @overload
+    def __getitem__(self, frame: slice) -> list[ControlPoints]: ...
+    def __getitem__(self, frame: int | slice) -> ControlPoints | list[ControlPoints]:
+        """Return those of a frame. Raises IndexError where they were left out."""
+        if isinstance(frame, slice):
+            return [self[number] for number in range(*frame.indices(self.num_frames))]
+        if not 0 <= frame - self.start < len(self.some):
+            raise IndexError(f"control points of frame {frame} were left out")
+        return self.some[frame - self.start]
 
 
 def densify_frame(

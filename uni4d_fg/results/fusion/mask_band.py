@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
 from uni4d_fg.results.fusion.background import Background
+from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
+from uni4d_fg.results.nearest import nearest_known
 
 _AROUND_PX = 4.0
 """Standard deviation of the window whose colors a pixel is compared with, working px."""
@@ -22,14 +26,58 @@ _RIM_PX, _RIM_STILL, _MIN_RIM = 2, 0.5, 20
 others 0.6 to 1. With fewer pixels that others see, it is not told."""
 _REACH_PX = 6.0
 """Colors of what moves are those farther inside, working px."""
-_FARTHEST_PX = 12
-"""Masks that are too large reach no farther beyond what moves, working px."""
+FARTHEST_PX = 12
+"""Masks that are too large reach no farther beyond what moves, and what moves no farther beyond others, working px."""
 _USUAL = 0.15
 """Nine tenths of the pixels that move have a confidence below 0.25."""
 _LARGEST, _PER_COLOR, _PER_CONFIDENCE = 8.0, 0.3, 0.13
 """Log likelihood ratio of colors at most, and what it and confidence count: fitted to scenes with truth."""
 _TRANSFER_NOISE = 2e-3
 """Variance of colors that are looked up in other frames, of 1."""
+_HALF = 0.5
+_SMOOTH_PX = 1.5
+"""What says that a pixel beside a mask moves is blurred by this, working px."""
+_GROWN, _PER_SHARE, _PER_LIKENESS = 0.16, 0.70, 0.45
+"""Log odds that it does: a constant, and what the share of its ring and its own colors count; fitted likewise."""
+
+
+class FittedMask(NamedTuple):
+    """Where a mask does not fit what moves, (h, w) each."""
+
+    still: BoolArray
+    """What stands still inside it; whatever outside."""
+    missed: BoolArray
+    """What moves outside of it."""
+
+    def applied(self, mask: Int32Array, size: WorkingSize) -> Int32Array:
+        """Return the mask (H, W) that fits: what it missed belongs to the instance that is nearest.
+
+        Args:
+            mask: (H, W) 0 static.
+            size: From (h, w) to (H, W).
+        """
+        still, missed = (size.enlarge(part.astype(np.float32)) > _HALF for part in self)
+        moving = np.where((mask > 0) & still, 0, mask)
+        missed &= mask == 0
+        if missed.any():
+            moving[missed] = mask.ravel()[nearest_known(mask > 0)[missed]]
+        return moving
+
+
+def fitted_mask(
+    image: ImageArray, mask: Int32Array, matched: Float32Array, static: BoolArray, behind: Background
+) -> FittedMask:
+    """Return where a mask is too large and where too small.
+
+    Args:
+        image: (H, W, 3) RGB.
+        mask: (H, W) 0 static.
+        matched: (h, w) confidence in the depth that several frames show of what stands still.
+        static: (h, w) neither masked nor in the band around masks.
+        behind: (h, w) what other frames show of the still scene in masks, and so far around them as they may miss.
+    """
+    still = stands_still(image, mask, matched, static, behind)
+    return FittedMask(still, moves_beside(image, mask, matched, behind))
 
 
 def looks_moving(image: ImageArray, mask: Int32Array, static: BoolArray) -> BoolArray:
@@ -43,7 +91,8 @@ def looks_moving(image: ImageArray, mask: Int32Array, static: BoolArray) -> Bool
     Returns:
         (h, w) where the colors inside a mask are the likelier ones, among pixels that are not static.
     """
-    small, inside = _shrunk(image, mask, static.shape)
+    small, share = _shrunk(image, mask, static.shape)
+    inside = share > _WHOLE
     if not inside.any():
         return np.zeros_like(static)
     return ~static & (_log_likelihood(small, inside) > _log_likelihood(small, static))
@@ -69,13 +118,14 @@ def stands_still(
         (h, w), whatever outside of masks.
     """
     still = matched > STILL
-    small, inside = _shrunk(image, mask, static.shape)
+    small, covered = _shrunk(image, mask, static.shape)
+    inside = covered > _WHOLE
     if not inside.any():
         return still
     depth = cv2.distanceTransform(np.pad(inside.astype(np.uint8), 1, mode="edge"), cv2.DIST_L2, 3)[1:-1, 1:-1]
     deep = inside & (depth > _REACH_PX)
     ring = np.ceil(depth).astype(np.int64)
-    along = inside & (ring <= _FARTHEST_PX)
+    along = inside & (ring <= FARTHEST_PX)
     seen = along & behind.seen
     if not deep.any() or np.count_nonzero(seen & (ring <= _RIM_PX)) < _MIN_RIM:
         return still
@@ -85,14 +135,50 @@ def stands_still(
     like_behind = np.where(told, np.clip(like_behind, -_LARGEST, _LARGEST), np.float32(0))
     if float((like_behind[seen & (ring <= _RIM_PX)] > 0).mean()) < _RIM_STILL:
         return still
-    many = np.bincount(ring[seen], minlength=_FARTHEST_PX + 1) + 1.0
-    share = np.bincount(ring[seen & (like_behind > 0)], minlength=_FARTHEST_PX + 1) / many
-    share = np.clip(np.minimum.accumulate(np.append(1.0, share[1:])), 0.02, 0.98)
+    share = _share_by_ring(ring, seen, like_behind > 0)
     # Farther inside than the mask is too large, what looks like the scene behind only looks like it.
     along &= ring <= np.count_nonzero(share >= _RIM_STILL)
-    odds = np.log(share / (1 - share))[np.minimum(ring, _FARTHEST_PX)]
+    odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
     confident = 2 * np.log(np.maximum(matched, np.float32(1e-3)) / np.float32(_USUAL))
     return np.asarray(still | (along & (odds + _PER_COLOR * like_behind + _PER_CONFIDENCE * confident > 0)))
+
+
+def moves_beside(image: ImageArray, mask: Int32Array, matched: Float32Array, behind: Background) -> BoolArray:
+    """Return which pixels beside masks move, as masks may be smaller than what moves.
+
+    They look like what is inside, and not like what other frames show of the still scene. In how many pixels that is
+    so is seen ring by ring, the farther from the mask the fewer; each is then judged by that share and by the colors
+    around it. What several frames show with confidence stands still.
+
+    Args:
+        image: (H, W, 3) RGB.
+        mask: (H, W) 0 static.
+        matched: (h, w) confidence in the depth that several frames show of what stands still.
+        behind: (h, w) what other frames show of the still scene, as far as masks may be too small.
+
+    Returns:
+        (h, w), outside of masks.
+    """
+    small, covered = _shrunk(image, mask, behind.seen.shape)
+    inside, outside = covered > _WHOLE, covered <= _HALF
+    if not inside.any():
+        return np.zeros_like(behind.seen)
+    ring = np.ceil(cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 3)).astype(np.int64)
+    along = outside & (ring <= FARTHEST_PX) & (matched <= STILL)
+    seen = along & behind.seen
+    like_moving = _log_likelihood(small, inside) - _like_background(small, behind)
+    like_moving = np.where(seen, np.clip(like_moving, -_LARGEST, _LARGEST), np.float32(0))
+    like_moving = cv2.GaussianBlur(like_moving, (0, 0), _SMOOTH_PX)
+    share = _share_by_ring(ring, seen, like_moving > 0)
+    odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
+    return np.asarray(along & (_GROWN + _PER_SHARE * odds + _PER_LIKENESS * like_moving > 0))
+
+
+def _share_by_ring(ring: IntArray, seen: BoolArray, alike: BoolArray) -> FloatArray:
+    """Return in which part of the pixels that are seen something is alike, by their distance, which it falls with."""
+    many = np.bincount(ring[seen], minlength=FARTHEST_PX + 1) + 1.0
+    share = np.bincount(ring[seen & alike], minlength=FARTHEST_PX + 1) / many
+    return np.clip(np.minimum.accumulate(np.append(1.0, share[1:])), 0.02, 0.98)
 
 
 def _like_background(image: Float32Array, behind: Background) -> Float32Array:
@@ -102,11 +188,12 @@ def _like_background(image: Float32Array, behind: Background) -> Float32Array:
     return np.asarray(-0.5 * (off**2 / variance + np.log(variance)).sum(axis=2), np.float32)
 
 
-def _shrunk(image: ImageArray, mask: Int32Array, shape: tuple[int, ...]) -> tuple[Float32Array, BoolArray]:
-    """Return image (h, w, 3), of 1, and which pixels (h, w) are all inside a mask."""
+def _shrunk(image: ImageArray, mask: Int32Array, shape: tuple[int, ...]) -> tuple[Float32Array, Float32Array]:
+    """Return image (h, w, 3), of 1, and the part of each pixel (h, w) that is inside a mask."""
     sides = (shape[1], shape[0])
     small = cv2.resize(image, sides, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(255.0)
-    return small, cv2.resize((mask > 0).astype(np.float32), sides, interpolation=cv2.INTER_AREA) > _WHOLE
+    covered = cv2.resize((mask > 0).astype(np.float32), sides, interpolation=cv2.INTER_AREA)
+    return small, np.asarray(covered, np.float32)
 
 
 def _log_likelihood(image: Float32Array, region: BoolArray) -> Float32Array:
