@@ -1,4 +1,4 @@
-"""Pixels beside a mask that look like what is inside."""
+"""Pixels beside a mask that look like what is inside, and masks that do not fit what moves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from uni4d_fg.results.fusion.background import Background
-from uni4d_fg.results.fusion.mask_band import looks_moving, stands_still
+from uni4d_fg.results.fusion.mask_band import FittedMask, fitted_mask, looks_moving, moves_beside, stands_still
+from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 
 HEIGHT, WIDTH = 48, 64
 
@@ -83,3 +84,51 @@ def test_where_no_frame_sees_what_is_behind_nothing_is_told(thing: np.ndarray, i
     mask = cv2.dilate(thing.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(np.int32)
     matched = np.full(thing.shape, 0.1, np.float32)
     assert not stands_still(image, mask, matched, mask == 0, behind).any()
+
+
+@pytest.mark.parametrize("margin", [2, 4, 6])
+def test_what_a_mask_misses_moves_where_other_frames_show_something_else(
+    margin: int, thing: np.ndarray, image: np.ndarray, rng: np.random.Generator
+) -> None:
+    small = cv2.erode(thing.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
+    seen = rng.random(thing.shape) < 0.8
+    matched = np.full(thing.shape, 0.1, np.float32)
+    found = moves_beside(image, small.astype(np.int32), matched, seen_behind(image, thing, seen, rng))
+    assert found[thing & ~small].mean() > 0.9
+    assert found[~thing].mean() < 0.05
+    assert not found[small].any()
+
+
+def test_a_mask_that_misses_nothing_is_not_grown(
+    thing: np.ndarray, image: np.ndarray, rng: np.random.Generator
+) -> None:
+    matched = np.full(thing.shape, 0.1, np.float32)
+    behind = seen_behind(image, thing, np.ones_like(thing), rng)
+    assert moves_beside(image, thing.astype(np.int32), matched, behind).mean() < 0.01
+    # Nor is anything that frames match with confidence, or that none shows.
+    small = cv2.erode(thing.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.int32)
+    assert not moves_beside(image, small, np.full(thing.shape, 0.9, np.float32), behind).any()
+    assert not moves_beside(image, small, matched, behind._replace(seen=np.zeros_like(thing))).any()
+    assert not moves_beside(image, np.zeros_like(small), matched, behind).any()
+
+
+def test_a_fitted_mask_gives_what_was_missed_to_the_nearest_instance() -> None:
+    mask = np.zeros((HEIGHT, WIDTH), np.int32)
+    mask[10:20, 10:20], mask[10:20, 40:50] = 3, 7
+    still, missed = np.zeros((2, HEIGHT, WIDTH), bool)
+    still[10:20, 10:12] = True
+    missed[10:20, 20:23] = missed[10:20, 37:40] = True
+    applied = FittedMask(still, missed).applied(mask, WorkingSize(HEIGHT, WIDTH, (HEIGHT, WIDTH)))
+    expected = np.zeros_like(mask)
+    expected[10:20, 12:23], expected[10:20, 37:50] = 3, 7
+    np.testing.assert_array_equal(applied, expected)
+
+
+def test_masks_that_flicker_fit_better(thing: np.ndarray, image: np.ndarray, rng: np.random.Generator) -> None:
+    """One side of a mask reaches too far, the other not far enough."""
+    mask = np.roll(thing, 4, axis=1)
+    behind = seen_behind(image, thing, np.ones_like(thing), rng)
+    static = cv2.dilate((mask | thing).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    fitted = fitted_mask(image, mask.astype(np.int32), np.full(thing.shape, 0.1, np.float32), static, behind)
+    applied = fitted.applied(mask.astype(np.int32), WorkingSize(HEIGHT, WIDTH, (HEIGHT, WIDTH))) > 0
+    assert np.count_nonzero(applied ^ thing) < 0.7 * np.count_nonzero(mask ^ thing)
