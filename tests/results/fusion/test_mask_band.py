@@ -110,6 +110,12 @@ def test_a_mask_that_misses_nothing_is_not_grown(
     assert not moves_beside(image, small, np.full(thing.shape, 0.9, np.float32), behind).any()
     assert not moves_beside(image, small, matched, behind._replace(seen=np.zeros_like(thing))).any()
     assert not moves_beside(image, np.zeros_like(small), matched, behind).any()
+    # Where a thing has the color of the scene, its colors tell nothing.
+    plain = np.full_like(image, 90)
+    alike = seen_behind(plain, np.zeros_like(thing), np.ones_like(thing), rng)._replace(
+        color=np.full(image.shape, 90 / 255, np.float32), variance=np.zeros(image.shape, np.float32)
+    )
+    assert not moves_beside(plain, small, matched, alike).any()
 
 
 def test_a_fitted_mask_gives_what_was_missed_to_the_nearest_instance() -> None:

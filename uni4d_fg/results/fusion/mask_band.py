@@ -34,10 +34,14 @@ _LARGEST, _PER_COLOR, _PER_CONFIDENCE = 8.0, 0.3, 0.13
 """Log likelihood ratio of colors at most, and what it and confidence count: fitted to scenes with truth."""
 _TRANSFER_NOISE = 2e-3
 """Variance of colors that are looked up in other frames, of 1."""
+_ALIKE = 1.5 * float(np.log(_TRANSFER_NOISE / _COLOR_NOISE))
+"""Log likelihood ratio of a thing and a scene of one and the same color: they differ in the least variance only."""
+_TELLS = 0.1
+"""A smaller ratio is rounding."""
 _HALF = 0.5
 _SMOOTH_PX = 1.5
 """What says that a pixel beside a mask moves is blurred by this, working px."""
-_GROWN, _PER_SHARE, _PER_LIKENESS = 0.16, 0.70, 0.45
+_GROWN, _PER_SHARE, _PER_LIKENESS = 0.37, 1.07, 0.24
 """Log odds that it does: a constant, and what the share of its ring and its own colors count; fitted likewise."""
 
 
@@ -166,12 +170,12 @@ def moves_beside(image: ImageArray, mask: Int32Array, matched: Float32Array, beh
     ring = np.ceil(cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 3)).astype(np.int64)
     along = outside & (ring <= FARTHEST_PX) & (matched <= STILL)
     seen = along & behind.seen
-    like_moving = _log_likelihood(small, inside) - _like_background(small, behind)
+    like_moving = _log_likelihood(small, inside) - _like_background(small, behind) - np.float32(_ALIKE)
     like_moving = np.where(seen, np.clip(like_moving, -_LARGEST, _LARGEST), np.float32(0))
-    like_moving = cv2.GaussianBlur(like_moving, (0, 0), _SMOOTH_PX)
-    share = _share_by_ring(ring, seen, like_moving > 0)
+    share = _share_by_ring(ring, seen, like_moving > _TELLS)
     odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
-    return np.asarray(along & (_GROWN + _PER_SHARE * odds + _PER_LIKENESS * like_moving > 0))
+    around = cv2.GaussianBlur(like_moving, (0, 0), _SMOOTH_PX)
+    return np.asarray(along & (_GROWN + _PER_SHARE * odds + _PER_LIKENESS * around > 0))
 
 
 def _share_by_ring(ring: IntArray, seen: BoolArray, alike: BoolArray) -> FloatArray:
