@@ -284,7 +284,9 @@ class DenseMaps:
         matched, static = self.size.shown(mine.depth.matched), self.size.shown(mine.static)
         color, variance, inverse = (self.size.shown(part) for part in behind[:3])
         seen = Background(color, variance, inverse, self.size.shown(behind.seen))
-        return fitted_mask(self.sequence.images[frame], mask, matched, static, seen)
+        fitted = fitted_mask(self.sequence.images[frame], mask, matched, static, seen)
+        # Of a frame without a sound cue too little is known to say what its mask misses.
+        return fitted._replace(missed=np.zeros_like(fitted.missed)) if frame in self.broken else fitted
 
     def _view(self, frame: int) -> View:
         made, pose = self._static(frame), self.scene["world_T_cam"][frame]
