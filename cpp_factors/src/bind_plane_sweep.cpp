@@ -26,8 +26,7 @@ FloatArray widened(const std::vector<float>& values, int height, int width) {
 std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> sweep(
     const AnyArray& image, const AnyArray& others, const AnyArray& turns, const AnyArray& shifts,
     const AnyArray& inverse_depth, int radius, double noise, double difference_share, double largest_difference,
-    int small_step, int large_step, double edge_contrast,
-    int threads) {
+    int small_step, int large_step, double edge_contrast, int threads) {
   const View<double> reference = expect_floats(image, "image", {kAnyLength, kAnyLength}, false);
   const std::int64_t rows = reference.shape[0], columns = reference.shape[1];
   const int height = expect_count(rows, "image"), width = expect_count(columns, "image");
@@ -76,8 +75,8 @@ std::tuple<FloatArray, FloatArray, FloatArray, FloatArray> sweep(
 void bind_plane_sweep(nb::module_& module) {
   module.def("plane_sweep", &sweep, nb::arg("image"), nb::arg("others"), nb::arg("turns"), nb::arg("shifts"),
              nb::arg("inverse_depth"), nb::kw_only(), nb::arg("radius"), nb::arg("noise"), nb::arg("difference_share"),
-             nb::arg("largest_difference"), nb::arg("small_step"),
-             nb::arg("large_step"), nb::arg("edge_contrast"), nb::arg("threads") = 0,
+             nb::arg("largest_difference"), nb::arg("small_step"), nb::arg("large_step"), nb::arg("edge_contrast"),
+             nb::arg("threads") = 0,
              "Multi-view depth of an image (H, W) from others (V, H, W), NaN where nothing is to be matched, that see "
              "its pixel x at inverse depth rho at turns (V, 3, 3) x + rho shifts (V, 3). Returns, (H, W) each: the "
              "best plane as a number between those of inverse_depth (D,), its aggregated cost, that of the best plane "

@@ -82,7 +82,7 @@ UNI4D_FG_CLONES void sum_differences(const float* __restrict warped, const float
   }
 }
 
-/// What the cost of a row is made of: sums of rows, and how they count.
+/// What the cost of a row is made of.
 struct RowSums {
   const float *w[16], *ww[16], *rw[16];  // (2 radius + 1) rows of what `sum_rows` gave
   const float* ad[2 * kNarrow + 1];      // and of what `sum_differences` gave
@@ -94,8 +94,8 @@ UNI4D_FG_CLONES void match_row(const RowSums& sums, int width, const SweepOption
                                const float* __restrict seen, std::uint8_t* __restrict out) {
   const int radius = options.radius, rows = 2 * radius + 1;
   const float share = 1.0F / static_cast<float>(rows * rows), noise2 = options.noise * options.noise;
-  const float of_difference =
-      options.difference_share * 255.0F / (options.largest_difference * static_cast<float>((2 * kNarrow + 1) * (2 * kNarrow + 1)));
+  constexpr auto kCompared = static_cast<float>((2 * kNarrow + 1) * (2 * kNarrow + 1));
+  const float of_difference = options.difference_share * 255.0F / (options.largest_difference * kCompared);
   const float of_correlation = 1.0F - options.difference_share;
   // In separate loops per chunk: each of them becomes SIMD, which one loop over all of it does not.
   float a[kChunk], b[kChunk], c[kChunk], e[kChunk], cost[kChunk];
@@ -155,7 +155,8 @@ class Matching {
     const int radius = options_.radius, width = width_, depth = static_cast<int>(planes_.size());
     const int top = std::max(0, begin - radius), low = std::min(height_, end + radius), rows = low - top;
     const auto cells = static_cast<std::size_t>(rows) * static_cast<std::size_t>(width);
-    for (auto* buffer : {&work.warped, &work.seen, &work.sum_w, &work.sum_ww, &work.sum_rw, &work.sum_ad}) buffer->resize(cells);
+    for (auto* buffer : {&work.warped, &work.seen, &work.sum_w, &work.sum_ww, &work.sum_rw, &work.sum_ad})
+      buffer->resize(cells);
     const auto out_cells = static_cast<std::size_t>(end - begin) * static_cast<std::size_t>(width);
     work.first.resize(out_cells);
     work.second.resize(out_cells);

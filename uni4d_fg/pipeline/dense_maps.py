@@ -6,7 +6,6 @@ from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, at_nearest_pixel, evenly_spread
@@ -21,7 +20,7 @@ from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, SomeControlPoints, densify_frame
 from uni4d_fg.results.fusion.guided_median import guided_median
 from uni4d_fg.results.fusion.lifting import lifted
-from uni4d_fg.results.fusion.mask_band import FARTHEST_PX, STILL, FittedMask, fitted_mask, looks_moving
+from uni4d_fg.results.fusion.mask_band import FARTHEST_PX, STILL, FittedMask, compare, fitted_mask, looks_moving
 from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_poor, is_preferred, tells_bleeding
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
@@ -274,19 +273,18 @@ class DenseMaps:
         # The frames next to it mostly have their masks in the same place.
         near = [number for number in self._near(frame) if abs(number - frame) > 1] or self._near(frame)
         masked = self.size.within(~self._static(frame).unmasked, False)
-        side = 2 * FARTHEST_PX + 1
-        around = cv2.dilate(masked.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        around = ~without_band(~masked, FARTHEST_PX)
         return background(self._view(frame), map(self._view, near), around)
 
     def _fitted(self, frame: int, mask: Int32Array, behind: Background) -> FittedMask:
         """Return where a mask is too large and where too small, as the shrunk image shows it."""
-        mine = self._static(frame)
-        matched, static = self.size.shown(mine.depth.matched), self.size.shown(mine.static)
         color, variance, inverse = (self.size.shown(part) for part in behind[:3])
         seen = Background(color, variance, inverse, self.size.shown(behind.seen))
-        fitted = fitted_mask(self.sequence.images[frame], mask, matched, static, seen)
         # Of a frame without a sound cue too little is known to say what its mask misses.
-        return fitted._replace(missed=np.zeros_like(fitted.missed)) if frame in self.broken else fitted
+        return fitted_mask(
+            compare(self.sequence.images[frame], mask, seen), self.size.shown(self._static(frame).depth.matched),
+            tells_missed=frame not in self.broken,
+        )  # fmt: skip
 
     def _view(self, frame: int) -> View:
         made, pose = self._static(frame), self.scene["world_T_cam"][frame]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uni4d_fg.results.fusion.background import Background
-from uni4d_fg.results.fusion.mask_band import FittedMask, fitted_mask, looks_moving, moves_beside, stands_still
+from uni4d_fg.results.fusion.mask_band import FittedMask, compare, fitted_mask, looks_moving, moves_beside, stands_still
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 
 HEIGHT, WIDTH = 48, 64
@@ -57,11 +57,10 @@ def test_what_a_mask_covers_besides_stands_still_where_other_frames_show_the_sam
     margin: int, thing: np.ndarray, image: np.ndarray, rng: np.random.Generator
 ) -> None:
     large = cv2.dilate(thing.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8))
-    static = cv2.dilate(large, np.ones((5, 5), np.uint8)) == 0
     rim = (large > 0) & ~thing
     seen = rng.random(thing.shape) < 0.8
     matched = np.full(thing.shape, 0.1, np.float32)
-    found = stands_still(image, large.astype(np.int32), matched, static, seen_behind(image, thing, seen, rng))
+    found = stands_still(compare(image, large.astype(np.int32), seen_behind(image, thing, seen, rng)), matched)
     assert found[rim & seen].mean() > 0.95
     assert found[rim & ~seen].mean() > 0.7  # as their neighbors
     assert found[thing].mean() < 0.05
@@ -69,12 +68,11 @@ def test_what_a_mask_covers_besides_stands_still_where_other_frames_show_the_sam
 
 def test_a_mask_that_fits_is_left_alone(thing: np.ndarray, image: np.ndarray, rng: np.random.Generator) -> None:
     behind = seen_behind(image, thing, np.ones_like(thing), rng)
-    static = cv2.dilate(thing.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     matched = np.full(thing.shape, 0.1, np.float32)
-    assert not stands_still(image, thing.astype(np.int32), matched, static, behind).any()
+    assert not stands_still(compare(image, thing.astype(np.int32), behind), matched).any()
     # What is matched with confidence stands still in any case.
     matched[14:16, 20:40] = 0.9
-    found = stands_still(image, thing.astype(np.int32), matched, static, behind)
+    found = stands_still(compare(image, thing.astype(np.int32), behind), matched)
     np.testing.assert_array_equal(found, matched > 0.6)
 
 
@@ -83,7 +81,7 @@ def test_where_no_frame_sees_what_is_behind_nothing_is_told(thing: np.ndarray, i
     behind = Background(nothing, nothing, nothing[..., 0], np.zeros_like(thing))
     mask = cv2.dilate(thing.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(np.int32)
     matched = np.full(thing.shape, 0.1, np.float32)
-    assert not stands_still(image, mask, matched, mask == 0, behind).any()
+    assert not stands_still(compare(image, mask, behind), matched).any()
 
 
 @pytest.mark.parametrize("margin", [2, 4, 6])
@@ -93,7 +91,7 @@ def test_what_a_mask_misses_moves_where_other_frames_show_something_else(
     small = cv2.erode(thing.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
     seen = rng.random(thing.shape) < 0.8
     matched = np.full(thing.shape, 0.1, np.float32)
-    found = moves_beside(image, small.astype(np.int32), matched, seen_behind(image, thing, seen, rng))
+    found = moves_beside(compare(image, small.astype(np.int32), seen_behind(image, thing, seen, rng)), matched)
     assert found[thing & ~small].mean() > 0.9
     assert found[~thing].mean() < 0.05
     assert not found[small].any()
@@ -104,18 +102,18 @@ def test_a_mask_that_misses_nothing_is_not_grown(
 ) -> None:
     matched = np.full(thing.shape, 0.1, np.float32)
     behind = seen_behind(image, thing, np.ones_like(thing), rng)
-    assert moves_beside(image, thing.astype(np.int32), matched, behind).mean() < 0.01
+    assert moves_beside(compare(image, thing.astype(np.int32), behind), matched).mean() < 0.01
     # Nor is anything that frames match with confidence, or that none shows.
     small = cv2.erode(thing.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.int32)
-    assert not moves_beside(image, small, np.full(thing.shape, 0.9, np.float32), behind).any()
-    assert not moves_beside(image, small, matched, behind._replace(seen=np.zeros_like(thing))).any()
-    assert not moves_beside(image, np.zeros_like(small), matched, behind).any()
+    assert not moves_beside(compare(image, small, behind), np.full(thing.shape, 0.9, np.float32)).any()
+    assert not moves_beside(compare(image, small, behind._replace(seen=np.zeros_like(thing))), matched).any()
+    assert not moves_beside(compare(image, np.zeros_like(small), behind), matched).any()
     # Where a thing has the color of the scene, its colors tell nothing.
     plain = np.full_like(image, 90)
     alike = seen_behind(plain, np.zeros_like(thing), np.ones_like(thing), rng)._replace(
         color=np.full(image.shape, 90 / 255, np.float32), variance=np.zeros(image.shape, np.float32)
     )
-    assert not moves_beside(plain, small, matched, alike).any()
+    assert not moves_beside(compare(plain, small, alike), matched).any()
 
 
 def test_a_fitted_mask_gives_what_was_missed_to_the_nearest_instance() -> None:
@@ -134,7 +132,8 @@ def test_masks_that_flicker_fit_better(thing: np.ndarray, image: np.ndarray, rng
     """One side of a mask reaches too far, the other not far enough."""
     mask = np.roll(thing, 4, axis=1)
     behind = seen_behind(image, thing, np.ones_like(thing), rng)
-    static = cv2.dilate((mask | thing).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
-    fitted = fitted_mask(image, mask.astype(np.int32), np.full(thing.shape, 0.1, np.float32), static, behind)
+    fitted = fitted_mask(
+        compare(image, mask.astype(np.int32), behind), np.full(thing.shape, 0.1, np.float32), tells_missed=True
+    )
     applied = fitted.applied(mask.astype(np.int32), WorkingSize(HEIGHT, WIDTH, (HEIGHT, WIDTH))) > 0
     assert np.count_nonzero(applied ^ thing) < 0.7 * np.count_nonzero(mask ^ thing)

@@ -77,10 +77,10 @@ def bleeding_radius(profiles: Sequence[EdgeProfile]) -> float:
     Returns:
         Working px, 0 if it does not bleed; NaN if the frames have too few edges to tell.
     """
-    count, total = (np.sum([getattr(p, name) for p in profiles], axis=0) for name in ("count", "total"))
+    count = np.sum([profile.count for profile in profiles], axis=0)
     if not profiles or (count < _MIN_PIXELS).any():
         return float("nan")
-    profile = total / count
+    profile = np.sum([profile.total for profile in profiles], axis=0) / count
     profile -= np.median(profile[len(profile) // 2 :])
     top = int(np.argmax(profile[:3]))
     if profile[top] < _LEAST:

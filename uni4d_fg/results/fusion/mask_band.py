@@ -68,20 +68,41 @@ class FittedMask(NamedTuple):
         return moving
 
 
-def fitted_mask(
-    image: ImageArray, mask: Int32Array, matched: Float32Array, static: BoolArray, behind: Background
-) -> FittedMask:
-    """Return where a mask is too large and where too small.
+class Compared(NamedTuple):
+    """A frame beside its mask and what other frames show of the still scene behind it, (h, w) each."""
+
+    color: Float32Array
+    """(h, w, 3) of 1."""
+    covered: Float32Array
+    """Part of each pixel that is inside a mask."""
+    like_background: Float32Array
+    """Log likelihood that it is what other frames show there; means nothing where none does."""
+    seen: BoolArray
+    """Where others show it."""
+
+
+def compare(image: ImageArray, mask: Int32Array, behind: Background) -> Compared:
+    """Compare a frame with what other frames show behind its mask.
 
     Args:
         image: (H, W, 3) RGB.
         mask: (H, W) 0 static.
-        matched: (h, w) confidence in the depth that several frames show of what stands still.
-        static: (h, w) neither masked nor in the band around masks.
-        behind: (h, w) what other frames show of the still scene in masks, and so far around them as they may miss.
+        behind: (h, w) in masks, and so far around them as they may miss.
     """
-    still = stands_still(image, mask, matched, static, behind)
-    return FittedMask(still, moves_beside(image, mask, matched, behind))
+    small, covered = _shrunk(image, mask, behind.seen.shape)
+    return Compared(small, covered, _like_background(small, behind), behind.seen)
+
+
+def fitted_mask(compared: Compared, matched: Float32Array, *, tells_missed: bool) -> FittedMask:
+    """Return where a mask is too large and where too small.
+
+    Args:
+        compared: The frame.
+        matched: (h, w) confidence in the depth that several frames show of what stands still.
+        tells_missed: Otherwise it is taken to be large enough.
+    """
+    still = stands_still(compared, matched)
+    return FittedMask(still, moves_beside(compared, matched) if tells_missed else np.zeros_like(still))
 
 
 def looks_moving(image: ImageArray, mask: Int32Array, static: BoolArray) -> BoolArray:
@@ -102,9 +123,7 @@ def looks_moving(image: ImageArray, mask: Int32Array, static: BoolArray) -> Bool
     return ~static & (_log_likelihood(small, inside) > _log_likelihood(small, static))
 
 
-def stands_still(
-    image: ImageArray, mask: Int32Array, matched: Float32Array, static: BoolArray, behind: Background
-) -> BoolArray:
+def stands_still(compared: Compared, matched: Float32Array) -> BoolArray:
     """Return which pixels inside masks stand still, as masks reach beyond what moves.
 
     What several frames show with confidence does. Where the rim of a mask looks like what other frames show of the
@@ -112,28 +131,24 @@ def stands_still(
     each is then judged by that share, by its own colors, and by its confidence.
 
     Args:
-        image: (H, W, 3) RGB.
-        mask: (H, W) 0 static.
+        compared: The frame.
         matched: (h, w) confidence in the depth that several frames show of what stands still.
-        static: (h, w) neither masked nor in the band around masks.
-        behind: What other frames show of the still scene there.
 
     Returns:
         (h, w), whatever outside of masks.
     """
     still = matched > STILL
-    small, covered = _shrunk(image, mask, static.shape)
-    inside = covered > _WHOLE
+    inside = compared.covered > _WHOLE
     if not inside.any():
         return still
     depth = cv2.distanceTransform(np.pad(inside.astype(np.uint8), 1, mode="edge"), cv2.DIST_L2, 3)[1:-1, 1:-1]
     deep = inside & (depth > _REACH_PX)
     ring = np.ceil(depth).astype(np.int64)
     along = inside & (ring <= FARTHEST_PX)
-    seen = along & behind.seen
+    seen = along & compared.seen
     if not deep.any() or np.count_nonzero(seen & (ring <= _RIM_PX)) < _MIN_RIM:
         return still
-    like_behind = _like_background(small, behind) - _log_likelihood(small, deep)
+    like_behind = compared.like_background - _log_likelihood(compared.color, deep)
     # Where nothing deeper inside is near, the colors say nothing.
     told = seen & np.isfinite(like_behind)
     like_behind = np.where(told, np.clip(like_behind, -_LARGEST, _LARGEST), np.float32(0))
@@ -147,7 +162,7 @@ def stands_still(
     return np.asarray(still | (along & (odds + _PER_COLOR * like_behind + _PER_CONFIDENCE * confident > 0)))
 
 
-def moves_beside(image: ImageArray, mask: Int32Array, matched: Float32Array, behind: Background) -> BoolArray:
+def moves_beside(compared: Compared, matched: Float32Array) -> BoolArray:
     """Return which pixels beside masks move, as masks may be smaller than what moves.
 
     They look like what is inside, and not like what other frames show of the still scene. In how many pixels that is
@@ -155,22 +170,19 @@ def moves_beside(image: ImageArray, mask: Int32Array, matched: Float32Array, beh
     around it. What several frames show with confidence stands still.
 
     Args:
-        image: (H, W, 3) RGB.
-        mask: (H, W) 0 static.
+        compared: The frame.
         matched: (h, w) confidence in the depth that several frames show of what stands still.
-        behind: (h, w) what other frames show of the still scene, as far as masks may be too small.
 
     Returns:
         (h, w), outside of masks.
     """
-    small, covered = _shrunk(image, mask, behind.seen.shape)
-    inside, outside = covered > _WHOLE, covered <= _HALF
+    inside, outside = compared.covered > _WHOLE, compared.covered <= _HALF
     if not inside.any():
-        return np.zeros_like(behind.seen)
+        return np.zeros_like(inside)
     ring = np.ceil(cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 3)).astype(np.int64)
     along = outside & (ring <= FARTHEST_PX) & (matched <= STILL)
-    seen = along & behind.seen
-    like_moving = _log_likelihood(small, inside) - _like_background(small, behind) - np.float32(_ALIKE)
+    seen = along & compared.seen
+    like_moving = _log_likelihood(compared.color, inside) - compared.like_background - np.float32(_ALIKE)
     like_moving = np.where(seen, np.clip(like_moving, -_LARGEST, _LARGEST), np.float32(0))
     share = _share_by_ring(ring, seen, like_moving > _TELLS)
     odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
