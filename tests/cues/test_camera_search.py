@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cues.start_scenes import GUESS, SIZE, K, TrackedScene, forward, sideways, tracked
+from cues.camera_scenes import FRAMES, path_error, ramp, structure, through
+from cues.start_scenes import GUESS, SIZE, K, forward, sideways, tracked
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.structure import camera_search, motion
-from uni4d_fg.cues.structure.camera_search import FoundCamera, is_lens, similarities
-from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.cues.structure.camera_search import FoundCamera, is_lens
+from uni4d_fg.cues.structure.motion import structure_from_motion
 from uni4d_fg.cues.structure.rivals import Rival
 from uni4d_fg.cues.track_motion import QuadraticGrid, SharedError
 from uni4d_fg.errors import SolverError
@@ -21,40 +22,8 @@ from uni4d_fg.geometry.camera import project, unproject, world_to_camera
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.geometry.se3 import inverse, so3_exp
 from uni4d_fg.progress import SilentReporter
-from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.sharpness import sharp_frames
-
-FRAMES = 20
-
-
-def through(scene: TrackedScene, camera: CameraModel) -> TrackedScene:
-    """Return the observations of a scene as another camera has them, as far as they are in its image."""
-    seen = scene.observations
-    uv = camera.real(seen.uv, seen.frame)
-    height, width = SIZE
-    inside = (uv >= 0).all(axis=1) & (uv <= [width - 1, height - 1]).all(axis=1)
-    return replace(scene, observations=replace(seen, uv=uv).select(inside).with_min_observations(2))
-
-
-def ramp(ratio: float) -> np.ndarray:
-    """Return the zoom of the frames, (T,), from one end to the other; the longest is 1."""
-    zoom = ratio ** np.linspace(0.0, 1.0, FRAMES)
-    return zoom / zoom.max()
-
-
-def structure(scene: TrackedScene, *changes: str) -> Structure:
-    found = structure_from_motion(
-        scene.observations, FRAMES, SIZE, GUESS, load_config("default", list(changes)), SilentReporter(),
-        lambda: False, any_camera=True,
-    )  # fmt: skip
-    assert found is not None
-    return found
-
-
-def path_error(found: Structure, scene: TrackedScene) -> float:
-    extent = np.linalg.norm(np.ptp(scene.world_T_cam[:, :3, 3], axis=0))
-    return evaluate_trajectory(found.world_T_cam, scene.world_T_cam).ate_m / float(extent)
 
 
 @pytest.mark.parametrize(
@@ -73,36 +42,10 @@ def test_a_lens_is_found_from_tracks_alone(k1: float) -> None:
     assert path_error(pinhole, scene) > 1.4 * path_error(found, scene)
 
 
-@pytest.mark.parametrize("ratio", [1.6, pytest.param(0.6, marks=pytest.mark.slow)])
-def test_a_zoom_is_found_from_tracks_alone(ratio: float) -> None:
-    wide = K * np.array([1.2, 1.2, 1.0, 1.0])
-    plain = tracked(sideways(FRAMES), points=1500)
-    # Tracks of K, as a camera would have them whose longest focal length is 1.2 times K's.
-    uv = K[2:] + (plain.observations.uv - K[2:]) * wide[:2] / K[:2]
-    zoom = ramp(ratio)
-    scene = through(replace(plain, observations=replace(plain.observations, uv=uv)), CameraModel(wide, zoom=zoom))
-    found = structure(scene)
-    assert found.camera.zoom is not None
-    assert found.camera.lens.is_pinhole
-    np.testing.assert_allclose(found.intrinsics[0] * found.camera.zoom, wide[0] * zoom, rtol=0.03)
-    assert path_error(found, scene) < 0.004
-    off = structure(scene, "camera.zoom=off", "camera.model=pinhole")
-    assert path_error(off, scene) > 5 * path_error(found, scene)
-
-
 @pytest.mark.parametrize(("path", "moving"), [(sideways, 0), (sideways, 150), (forward, 0)])
 def test_a_pinhole_that_does_not_zoom_is_left_one(path, moving: int) -> None:  # type: ignore[no-untyped-def]
     scene = tracked(path(FRAMES), points=1500, moving=moving)
     assert structure(scene).camera.is_plain
-
-
-def test_a_zoom_that_is_asked_for_is_taken_and_one_beside_another_model_not_sought() -> None:
-    scene = tracked(sideways(FRAMES))
-    asked = structure(scene, "camera.zoom=on").camera.zoom
-    assert asked is not None
-    assert np.ptp(asked) < 0.02
-    zoomed = through(scene, CameraModel(K, zoom=ramp(1.6)))
-    assert structure(zoomed, "camera.model=pinhole").camera.is_plain
 
 
 def test_a_search_that_fails_leaves_the_pinhole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,15 +152,6 @@ def test_a_camera_that_is_known_is_not_looked_for() -> None:
     assert found.camera.lens == lens
     np.testing.assert_array_equal(found.intrinsics, K)
     assert path_error(found, scene) < 0.004
-
-
-def test_a_similarity_tells_a_zoom_of_a_camera_that_only_turns() -> None:
-    turning = sideways(FRAMES)
-    turning[:, :3, 3] = 0.0
-    scene = through(tracked(turning, noise_px=0.1), CameraModel(K, zoom=ramp(1.6)))
-    np.testing.assert_allclose(
-        similarities(scene.observations, FRAMES, SIZE), np.linspace(0, np.log(1.6), 20), atol=0.02
-    )
 
 
 @pytest.mark.parametrize(

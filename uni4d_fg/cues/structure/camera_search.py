@@ -2,33 +2,35 @@ r"""Whether the tracks of a grown scene ask for a lens, or for a focal length pe
 
 A pinhole that was fitted to tracks of another camera is a minimum that two steps with little damping leave, as in
 :mod:`uni4d_fg.slam.lens`: on clips without a lens or zoom they take away 0.07 % of the reprojection energy by
-distortion and change a focal length per frame by 1 % at most, on others 0.6 % and 2.6 % at least. Only where more is
-found another camera is looked for.
+distortion and change a focal length per frame by 1 % at most, on others by 0.6 % and 1.6 % at least. Only where more
+is found another camera is looked for.
 
 A lens bends the cameras little, so that its search starts from them. Bundle adjustment with a lens goes part of the way
 only, as the tracks that agree with a pinhole are those that a lens bends least; with tracks judged and triangulated
 anew, two or three rounds end at the lens, from a focal length of twice its own (k1 of -0.25), too.
 
-A zoom takes all cameras along: without it they end at several times the focal length. So they are grown anew, from
-tracks that do not zoom as far as a similarity tells: how much farther apart points are in the next frame. (Motion
-along the view does that, too; bundle adjustment with a focal length per frame then tells them apart.) The focal length
-is held at what was given until then, as it is what runs away.
+A zoom takes all cameras along; it is looked for in :mod:`uni4d_fg.cues.structure.zoom_search`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from uni4d_fg.arrays import Float32Array, FloatArray
+from uni4d_fg.arrays import Float32Array
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, fit_zoom, part_of, probing, scene_of
-from uni4d_fg.cues.structure.first_pair import CommonTracks
+from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, part_of, probing, scene_of
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens, halves_agree_on_zoom
+from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
+from uni4d_fg.cues.structure.zoom_search import (
+    Grown,
+    asks_for_zoom,
+    explains_most,
+    find_zoom,
+    focal_range,
+    may_be_zoom,
+    similar_zoom,
+)
 from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry.lens import LensModel
 from uni4d_fg.slam.lens.camera_model import CameraModel
@@ -36,11 +38,6 @@ from uni4d_fg.slam.lens.sharpness import sharp_frames
 from uni4d_fg.slam.lens.strength import Strength, strength_of
 from uni4d_fg.slam.stages.observations import Observations
 
-Grown = Callable[[Observations, FloatArray], GrowingScene | None]
-"""Grows a scene from ideal observations, with intrinsics that are held."""
-
-_PROBED = 0.4
-"""Part of a zoom that the steps of the probe find, at least."""
 _MIN_LENS_EVIDENCE = 0.003
 """Part of the reprojection energy that distortion must take away for a lens to be looked for."""
 _MIN_SECOND_EVIDENCE = 0.004
@@ -52,13 +49,6 @@ _LENS_STAYS = 0.003
 _HOPELESS = 0.2
 """Part by which a lens has more energy than a rival, after a round, at which no other round follows: a scene with near
 and far exchanged that took over had 0.15 less from the first round on, one that did not had 0.66 more."""
-_ZOOM_ROUNDS = 3
-_ZOOM_STEPS = 200
-_SETTLED = 0.003
-"""Change of the log zoom in a round below which it is found."""
-_FAR_APART = 0.1
-"""Points nearer to each other than this part of the image's diagonal say little of a similarity."""
-_PAIRS = 4000
 
 
 @dataclass(frozen=True)
@@ -68,6 +58,8 @@ class FoundCamera:
     camera: CameraModel
     lens_gain: float
     """Part of the reprojection energy that a lens takes away, if one was looked for."""
+    open_focal: tuple[float, ...] = ()
+    """Shortest and longest focal length, px, of a zoom that explains all tracks better, but not most of them."""
 
 
 def find_camera(
@@ -79,7 +71,7 @@ def find_camera(
     proposed: CameraModel | None = None,
     blur_px: Float32Array | None = None,
 ) -> FoundCamera | None:
-    """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom.
+    """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom, beyond doubt.
 
     Args:
         scene: Grown with such a pinhole.
@@ -101,48 +93,28 @@ def find_camera(
         return None
     plain = Fitted(CameraModel(part.intrinsics), part)
     starts = [proposed] if proposed is not None and proposed.zoom is not None else []
-    if _asks_for_zoom(plain, config):
-        log_ratio = similarities(scene.observations, len(scene.registered), image_size)
-        starts.append(CameraModel(scene.prior_intrinsics, zoom=np.exp(log_ratio - log_ratio.max())))
+    if asks_for_zoom(plain, config):
+        starts.append(similar_zoom(scene, image_size))
     asks_for_lens = settings.model == "auto" and (
         fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
     if not (starts or asks_for_lens):
         return None
     judge = TrackJudge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
-    best, gain = plain, 0.0
+    best, gain, open_focal = plain, 0.0, tuple[float, ...]()
     if asks_for_lens:
         lens = _find_lens(plain, judge, config)
         gain = judge.better(lens, plain)[0]
         if is_lens(lens.camera, image_size, gain, config) and halves_agree_on_lens(lens, image_size, config):
             best = lens
-    for start in starts:
-        zoom = _find_zoom(start, plain, judge, scene, real, config, grown)
-        if zoom is not None and (settings.zoom == "on" or _is_zoom(zoom, plain, best, judge, config)):
-            best = zoom
-    return None if best is plain else FoundCamera(best.camera, gain)
-
-
-def _asks_for_zoom(plain: Fitted, config: Config) -> bool:
-    settings = config.camera
-    if settings.zoom != "auto" or settings.model != "auto":
-        return settings.zoom == "on"
-    posed = np.flatnonzero(plain.scene.registered)
-    if posed[-1] + int(np.diff(posed).max(initial=1)) < len(plain.scene.registered):
-        return False  # Tracks are too short for so many frames, and nothing would be known of the rest.
-    probe = fit_zoom(plain, config, probing(config))
-    assert probe.camera.zoom is not None
-    moves = float(np.ptp(np.log(probe.camera.zoom))) >= _PROBED * settings.min_zoom
-    return probe.evidence >= settings.min_zoom_evidence and moves
-
-
-def _is_zoom(zoom: Fitted, plain: Fitted, best: Fitted, judge: TrackJudge, config: Config) -> bool:
-    """Tell whether the focal length changes enough, for most tracks, alike in their halves, and explains all better."""
-    settings, ratio = config.camera, zoom.camera.zoom
-    if ratio is None or ratio.max() / ratio.min() - 1.0 < settings.min_zoom:
-        return False
-    explains = judge.better(zoom, plain)[1] >= settings.min_zoom_agreement and judge.better(zoom, best)[0] > 0.0
-    return explains and halves_agree_on_zoom(zoom, config)
+    if starts:
+        zoom = find_zoom(starts, plain, judge, scene, real, config, grown)
+        if zoom is not None and (settings.zoom == "on" or may_be_zoom(zoom, best, judge, config)):
+            if settings.zoom == "on" or explains_most(zoom, plain, judge, config):
+                best = zoom
+            else:
+                open_focal = focal_range(zoom)
+    return None if best is plain and not open_focal else FoundCamera(best.camera, gain, open_focal)
 
 
 def lens_strength(camera: CameraModel, image_size: tuple[int, int], config: Config) -> Strength:
@@ -197,53 +169,3 @@ def _with_lens(found: Fitted, rival: Fitted, judge: TrackJudge, config: Config) 
         return found
     richer = fit_lens(found, "RADIAL", config, to_the_end)
     return found if richer.evidence < _MIN_SECOND_EVIDENCE else judged_anew(richer)
-
-
-def _find_zoom(
-    camera: CameraModel, plain: Fitted, judge: TrackJudge, scene: GrowingScene, real: Observations, config: Config,
-    grown: Grown,
-) -> Fitted | None:  # fmt: skip
-    """Grow scenes from tracks whose zoom is undone, at first that of a camera to start from, and free what is left.
-
-    None if no scene grows, or if after a round most tracks fit the camera that does not zoom better: of a zoom that is
-    one, seven tenths or more fit it then.
-    """
-    settings = config.camera
-    to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": _ZOOM_STEPS}
-    found = None
-    for _ in range(_ZOOM_ROUNDS):
-        start = grown(camera.ideal_observations(real), camera.intrinsics)
-        if start is None:
-            return found
-        part = part_of(start, settings.observations, plain.scene.registered)
-        part.free_focal = scene.free_focal
-        found = fit_zoom(Fitted(camera, part), config, to_the_end)
-        assert camera.zoom is not None
-        assert found.camera.zoom is not None
-        if settings.zoom == "auto" and judge.better(found, plain)[1] < 0.5:
-            return None
-        settled = float(np.ptp(np.log(found.camera.zoom / camera.zoom))) < _SETTLED
-        camera = found.camera
-        if settled:
-            break
-    return found
-
-
-def similarities(observations: Observations, num_frames: int, image_size: tuple[int, int]) -> FloatArray:
-    """Return by how much, in logarithms, what is seen grows from the first frame on (T,), as a similarity tells."""
-    common = CommonTracks(observations, num_frames)
-    far = _FAR_APART * float(np.hypot(*image_size))
-    out = np.zeros(num_frames)
-    rng = np.random.default_rng(0)
-    for frame in range(1, num_frames):
-        before, after = (observations.uv[rows] for rows in common.between(frame - 1, frame))
-        step = 0.0
-        if len(before):
-            one, other = rng.integers(len(before), size=(2, _PAIRS))
-            apart = np.linalg.norm(before[one] - before[other], axis=1)
-            known = apart > far
-            if known.any():
-                later = np.linalg.norm(after[one] - after[other], axis=1)
-                step = float(np.median(np.log(np.maximum(later[known], 1e-9) / apart[known])))
-        out[frame] = out[frame - 1] + step
-    return out

@@ -56,22 +56,35 @@ class HeldOut:
 
 
 def robust_energy(scene: GrowingScene, sigma_px: float) -> float:
-    """Return the mean robust energy of a scene's own observations, every track triangulated, however its rays meet.
-
-    By how many points a scene has, the one of more parallax would win, be it as wrong as it may. What has no point in
-    front of the cameras counts as lost.
+    """Return the mean robust energy of a scene's own observations, see :func:`energy_of_cameras`.
 
     Args:
         scene: Cameras, and tracks.
         sigma_px: Noise of the tracks; of scenes that are compared, one.
     """
-    used = scene.registered[scene.observations.frame]
-    seen = scene.observations.select(used)
-    rays = RayBundle(
-        scene.row[used], scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, scene.num_tracks
-    )  # fmt: skip
+    return energy_of_cameras(scene, scene.observations, np.full(len(scene.observations), sigma_px))
+
+
+def energy_of_cameras(
+    scene: GrowingScene, observations: Observations, sigma_px: FloatArray, lost: float = _LOST
+) -> float:
+    """Return the mean robust energy of observations in cameras, every track triangulated, however its rays meet.
+
+    By how many points a scene has, the one of more parallax would win, be it as wrong as it may. What has no point in
+    front of the cameras counts as lost.
+
+    Args:
+        scene: Its cameras; its points take no part.
+        observations: N, of any tracks.
+        sigma_px: Noise of each (N,).
+        lost: Where errors are cut, in sigmas.
+    """
+    used = scene.registered[observations.frame]
+    seen, sigma_px = observations.select(used), sigma_px[used]
+    tracks, row = seen.rows()
+    rays = RayBundle(row, scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, len(tracks))
     error = triangulate(rays, scene.config.geometric_depth.triangulation_huber_px).errors_of(rays) / sigma_px
-    return float(np.log1p(np.fmin(error, _LOST) ** 2).mean())
+    return float(np.log1p(np.fmin(error, lost) ** 2).mean())
 
 
 def errors_of(scene: GrowingScene, observations: Observations) -> FloatArray:

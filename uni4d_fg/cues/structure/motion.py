@@ -184,6 +184,8 @@ def structure_from_motion(
             found = None
         reporter.end()
         if found is not None:
+            beside += found.open_focal
+        if found is not None and not found.camera.is_plain:
             ideal = found.camera.ideal_observations(observations)
             again = search.grow(ideal, found.camera.intrinsics, free_focal)
             if again is not None:
@@ -191,7 +193,7 @@ def structure_from_motion(
                 is_open = is_lens and any(focal_is_open(each.scene, image_size) for each in (grown, again))
                 taken = not is_lens or search.tells_lens(grown, again, found, is_open)
                 if is_open or (taken and search.is_weak(found.camera)):
-                    beside = [(grown if taken else again).scene.mean_focal]
+                    beside.append((grown if taken else again).scene.mean_focal)
                 if taken and readout is not None and not is_told_still(again.scene, ideal, readout, image_size):
                     return structure_from_motion(
                         seen, num_frames, image_size, intrinsics, without_rolling_shutter(config), reporter,

@@ -1,0 +1,45 @@
+"""Tracks of a scene seen by cameras with a lens or a zoom, and the cameras that are found from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from cues.start_scenes import GUESS, SIZE, TrackedScene
+
+from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
+from uni4d_fg.progress import SilentReporter
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+from uni4d_fg.slam.lens.camera_model import CameraModel
+
+FRAMES = 20
+
+
+def through(scene: TrackedScene, camera: CameraModel) -> TrackedScene:
+    """Return the observations of a scene as another camera has them, as far as they are in its image."""
+    seen = scene.observations
+    uv = camera.real(seen.uv, seen.frame)
+    height, width = SIZE
+    inside = (uv >= 0).all(axis=1) & (uv <= [width - 1, height - 1]).all(axis=1)
+    return replace(scene, observations=replace(seen, uv=uv).select(inside).with_min_observations(2))
+
+
+def ramp(ratio: float) -> np.ndarray:
+    """Return the zoom of the frames, (T,), from one end to the other; the longest is 1."""
+    zoom = ratio ** np.linspace(0.0, 1.0, FRAMES)
+    return zoom / zoom.max()
+
+
+def structure(scene: TrackedScene, *changes: str) -> Structure:
+    found = structure_from_motion(
+        scene.observations, FRAMES, SIZE, GUESS, load_config("default", list(changes)), SilentReporter(),
+        lambda: False, any_camera=True,
+    )  # fmt: skip
+    assert found is not None
+    return found
+
+
+def path_error(found: Structure, scene: TrackedScene) -> float:
+    extent = np.linalg.norm(np.ptp(scene.world_T_cam[:, :3, 3], axis=0))
+    return evaluate_trajectory(found.world_T_cam, scene.world_T_cam).ate_m / float(extent)
