@@ -128,7 +128,7 @@ class DenseMaps:
         multiview = self.config.multiview
         poses: FloatArray = self.scene["world_T_cam"]
         self.multiview = MultiviewDepth(
-            self._working_frame, self.size, self.intrinsics[0], poses, self._landmarks, multiview, self.threads
+            self._working_frame, self.size, self.intrinsics, poses, self._landmarks, multiview, self.threads
         )
 
     def apart(self, first: int, stop: int) -> DenseMaps:

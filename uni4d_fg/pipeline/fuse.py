@@ -91,7 +91,7 @@ def fuse_depth(
         config,
         intrinsics,
         frozenset(known.broken),
-        _unmatchable(config, zoom, size, sequence.depth_parallax),
+        _unmatchable(config, zoom is not None and not lens.is_pinhole, size, sequence.depth_parallax),
         thread_count(),
         size or plain,
     )
@@ -136,7 +136,7 @@ def _note(sure: ConfidenceWriter | None, told: ToldError, confidence: ImageArray
 
 
 def _unmatchable(
-    config: FusionConfig, zoom: FloatArray | None, size: WorkingSize | None, depth_parallax: bool | None
+    config: FusionConfig, zooms_and_bends: bool, size: WorkingSize | None, depth_parallax: bool | None
 ) -> str:
     """Return why there can be no depth from several views, which no size is for; nothing if there can be."""
     core, reason = find_extension()
@@ -144,8 +144,8 @@ def _unmatchable(
         return "is switched off"
     if depth_parallax is False:
         return "is not made of a camera that only rotates"
-    if zoom is not None:
-        return "is not made of frames that zoom"
+    if zooms_and_bends:
+        return "is not made of frames that zoom through a lens that bends them"
     if size is None:
         return "is not made of images of so wide a lens"
     return "" if core is not None else f"is left out, as {reason}: run `{INSTALL_COMMAND}`"

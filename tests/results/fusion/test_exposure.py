@@ -33,7 +33,7 @@ def test_factor_is_found_beside_what_moves(factor: float, seed: int) -> None:
     own, other = wall(np.eye(4)), np.float32(factor) * wall(ALONG_X)
     other[:, :15] = np.nan  # masked
     other[20:30, 30:40] = 0.9  # a highlight that only this frame shows
-    found = exposures(Shown(own, np.eye(4)), [Shown(other, ALONG_X), Shown(own, np.eye(4))], points(rng, 3000), K)
+    found = exposures(Shown(own, np.eye(4), K), [Shown(other, ALONG_X, K), Shown(own, np.eye(4), K)], points(rng, 3000))
     assert found == pytest.approx([1 / factor, 1.0], rel=5e-3)
 
 
@@ -46,4 +46,4 @@ def test_too_few_points_change_nothing(case: str, rng: np.random.Generator) -> N
         other = 0.01 * other
     if case == "masked":
         other = np.full_like(other, np.nan)
-    assert exposures(Shown(wall(np.eye(4)), np.eye(4)), [Shown(other, ALONG_X)], seen, K) == [1.0]
+    assert exposures(Shown(wall(np.eye(4)), np.eye(4), K), [Shown(other, ALONG_X, K)], seen) == [1.0]

@@ -10,6 +10,7 @@ from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.results.fusion.multiview.sweep import Swept, sweep
 from uni4d_fg.results.fusion.multiview.sweep_numpy import sweep_numpy
+from uni4d_fg.results.fusion.pixel_transfer import PixelTransfer, pixel_transfer
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 80.0
 K = np.array([FOCAL, FOCAL, 39.5, 29.5])
@@ -30,10 +31,10 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 + 0.09 * np.sum(waves, axis=0), np.float32)
 
 
-def view(pose: np.ndarray, box: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def view(pose: np.ndarray, box: bool = True, zoom: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Image and depth of a slanted wall, with a nearer board in front of it, seen without rotation."""
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    x, y = (u - K[2]) / FOCAL, (v - K[3]) / FOCAL
+    x, y = (u - K[2]) / (zoom * FOCAL), (v - K[3]) / (zoom * FOCAL)
     ox, oy, oz = pose[:3, 3]
     z = (3.0 + 0.5 * ox - oz) / (1.0 - 0.5 * x)  # the wall Z = 3 + X / 2
     image = texture(ox + x * z, oy + y * z)
@@ -49,9 +50,15 @@ def at(x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
     return pose
 
 
+def transfers(poses: list[np.ndarray], zoom: float = 1.0) -> list[PixelTransfer]:
+    """Where cameras at poses see the pixels of the one at the origin, with so many times its focal length."""
+    longer = K * np.array([zoom, zoom, 1.0, 1.0])
+    return [pixel_transfer(K, longer, np.linalg.inv(pose)) for pose in poses]
+
+
 def swept(poses: list[np.ndarray], image: np.ndarray) -> Swept:
     planes = np.linspace(0.2, 0.8, 48)
-    return sweep(image, [view(p)[0] for p in poses], [np.linalg.inv(p) for p in poses], K, planes, MultiviewConfig())
+    return sweep(image, [view(p)[0] for p in poses], transfers(poses), planes, MultiviewConfig())
 
 
 def relative_error(found: Swept, truth: np.ndarray) -> np.ndarray:
@@ -70,6 +77,18 @@ def test_depth_of_a_known_scene(motion: str) -> None:
     assert np.mean(error < 0.05) > (0.9 if motion == "sideways" else 0.65)
 
 
+@pytest.mark.parametrize("zoom", [0.8, 1.3])
+def test_depth_from_views_that_zoom(zoom: float) -> None:
+    steps = [at(0.25), at(-0.25), at(0.0, 0.25), at(0.1, 0.0, 0.2)]
+    image, truth = view(at(0.0))
+    others = [view(pose, zoom=zoom)[0] for pose in steps]
+    planes = np.linspace(0.2, 0.8, 48)
+    error = relative_error(sweep(image, others, transfers(steps, zoom), planes, MultiviewConfig()), truth)
+    assert np.median(error[12:-12, 12:-12]) < 0.01
+    ignorant = relative_error(sweep(image, others, transfers(steps), planes, MultiviewConfig()), truth)
+    assert np.median(ignorant[12:-12, 12:-12]) > 0.1
+
+
 def test_differences_of_gray_values_keep_edges(rng: np.random.Generator) -> None:
     """Beside a thing in front of a wall of little contrast, windows say only where the thing is."""
     steps = [at(0.25), at(-0.25), at(0.0, 0.25), at(0.0, -0.25)]
@@ -82,11 +101,11 @@ def test_differences_of_gray_values_keep_edges(rng: np.random.Generator) -> None
     image, truth = seen(at(0.0)), view(at(0.0))[1]
     board = (truth < 1.7).astype(np.uint8)
     beside = (cv2.dilate(board, np.ones((7, 7), np.uint8)) > 0) & (board == 0)
-    others, poses, planes = [seen(p) for p in steps], [np.linalg.inv(p) for p in steps], np.linspace(0.2, 0.8, 48)
+    others, planes = [seen(p) for p in steps], np.linspace(0.2, 0.8, 48)
     nearer = []
     for share in (0.0, 0.4):
         config = MultiviewConfig(difference_share=share)
-        found = 1.0 / sweep(image, others, poses, K, planes, config).inverse_depth
+        found = 1.0 / sweep(image, others, transfers(steps), planes, config).inverse_depth
         nearer.append(float(np.mean(found[beside] < 2.0)))
     assert nearer[1] < 0.6 * nearer[0]
 
@@ -99,7 +118,7 @@ def test_what_is_marked_moving_is_not_matched() -> None:
         other = view(pose)[0]
         other[20:40, 30:50] = np.nan
         others.append(other)
-    found = sweep(image, others, [np.linalg.inv(p) for p in poses], K, np.linspace(0.2, 0.8, 48), MultiviewConfig())
+    found = sweep(image, others, transfers(poses), np.linspace(0.2, 0.8, 48), MultiviewConfig())
     assert np.isfinite(found.inverse_depth).all()
     assert np.mean(relative_error(found, truth) < 0.05) > 0.8
 

@@ -1,4 +1,4 @@
-"""Dense depth through a lens: frames are matched, and it is as good as through a pinhole."""
+"""Dense depth through a lens, and of a camera that zooms: frames are matched, and it is as good as through a pinhole."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from zooming import ramp, zoom_sequence
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
@@ -45,9 +46,10 @@ def scene(lens: Lens, focal: float) -> Sequence:
     return dataclasses.replace(sequence, depths=ArrayFrames(cue), intrinsics=truth.intrinsics, lens=lens)
 
 
-def fused(sequence: Sequence, folder: Path) -> tuple[float, float, int]:
+def fused(sequence: Sequence, folder: Path, *changes: str) -> tuple[float, float, int]:
     """Static AbsRel, the part of the sure pixels that are right to 3 %, and how many frames were matched."""
-    config = load_config("default", ["output.clouds=false", "output.pictures=false", "input.intrinsics=fixed"])
+    without = ["output.clouds=false", "output.pictures=false", "input.intrinsics=fixed"]
+    config = load_config("default", [*without, *changes])
     stage = reconstruct(sequence, folder, config).stages["fusion"]
     truth, masks = sequence.ground_truth.depths, sequence.masks
     assert truth is not None
@@ -69,3 +71,19 @@ def test_depth_through_a_lens_is_as_good_as_through_a_pinhole(tmp_path: Path) ->
         assert bent[2] == FRAMES
         assert bent[0] < 1.05 * error
         assert bent[1] > right - 0.01
+
+
+@pytest.mark.skipif(find_extension()[0] is None, reason="needs the C++ extension")
+def test_frames_that_zoom_are_matched(tmp_path: Path) -> None:
+    still = scene(PINHOLE, 150.0)
+    ratio = ramp(FRAMES, 1.5)
+    longest = np.array([ratio.max(), ratio.max(), 1.0, 1.0])
+    zoomed = dataclasses.replace(
+        zoom_sequence(still, ratio), intrinsics=still.intrinsics * longest, zoom=ratio / ratio.max()
+    )
+    error, right, matched = fused(zoomed, tmp_path / "matched")
+    assert matched == FRAMES
+    assert right > 0.9
+    without, _, none = fused(zoomed, tmp_path / "not", "fusion.multiview.enabled=false")
+    assert none == 0
+    assert error < 0.5 * without

@@ -22,36 +22,37 @@ class Shown(NamedTuple):
     """(h, w), 0 to 1, NaN where something moves."""
     world_T_cam: FloatArray
     """(4, 4)."""
+    intrinsics: FloatArray
+    """(4,) px, of this size."""
 
 
-def exposures(own: Shown, others: list[Shown], points: FloatArray, intrinsics: FloatArray) -> list[float]:
+def exposures(own: Shown, others: list[Shown], points: FloatArray) -> list[float]:
     """Return the factors that bring other frames to the brightness of one, as points tell that both show.
 
     Args:
         own: The frame.
         others: V other ones.
         points: (N, 3) static, world, m.
-        intrinsics: (4,) px, of all of them.
 
     Returns:
         V factors; 1 where too few points tell.
     """
     points = points[evenly_spread(len(points), _MAX_POINTS)]
-    here = _gray_at(own, points, intrinsics)
+    here = _gray_at(own, points)
     factors = []
     for other in others:
-        there = _gray_at(other, points, intrinsics)
+        there = _gray_at(other, points)
         with np.errstate(invalid="ignore"):
             both = (here > _DARK) & (there > _DARK)
         factors.append(float(np.median(here[both] / there[both])) if np.count_nonzero(both) >= _MIN_POINTS else 1.0)
     return factors
 
 
-def _gray_at(shown: Shown, points: FloatArray, intrinsics: FloatArray) -> Float32Array:
+def _gray_at(shown: Shown, points: FloatArray) -> Float32Array:
     """Return the gray values (N,) at which a frame shows points, NaN where it does not."""
     inside = world_to_camera(np.broadcast_to(shown.world_T_cam, (len(points), 4, 4)), points)
     front = inside[:, 2] > 1e-6
-    uv = project(intrinsics, np.where(front[:, None], inside, [0.0, 0.0, 1.0])).astype(np.float32)
+    uv = project(shown.intrinsics, np.where(front[:, None], inside, [0.0, 0.0, 1.0])).astype(np.float32)
     values = cv2.remap(
         shown.gray, uv[:, :1], uv[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4
     )

@@ -59,10 +59,6 @@ class IdealSize(WorkingSize):
         fx, fy, *center = self.shrunk.intrinsics(intrinsics)
         return np.array([fx, fy, *(center + self.shift)])
 
-    def pinhole(self, intrinsics: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
-        """Return intrinsics (4,) and size (height, width), px, of a pinhole that sees what the images show."""
-        return self.intrinsics(intrinsics), (self.height, self.width)
-
     def pixels(self, uv: FloatArray) -> FloatArray:
         """Return image pixels (N, 2) in working pixels, ideal ones; far outside if no direction reaches them."""
         ideal = self.lens.ideal_pixels(self.camera, self.shrunk.pixels(uv))

@@ -17,6 +17,7 @@ from uni4d_fg.results.fusion.multiview.planes import choose_planes
 from uni4d_fg.results.fusion.multiview.sweep import sweep
 from uni4d_fg.results.fusion.multiview.views import choose_views
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize
+from uni4d_fg.results.fusion.pixel_transfer import pixel_transfer
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class MultiviewDepth:
     frames: Callable[[int], WorkingFrame]
     size: WorkingSize
     intrinsics: FloatArray
-    """(4,) px, of the images."""
+    """(T, 4) px, of the images."""
     world_T_cam: FloatArray
     """(T, 4, 4)."""
     seen: Callable[[int], FloatArray]
@@ -53,6 +54,11 @@ class MultiviewDepth:
     threads: int = 0
     raw: dict[int, _Raw | None] = field(default_factory=dict)
     shown: dict[int, WorkingFrame] = field(default_factory=dict)
+    cameras: FloatArray = field(init=False)
+    """(T, 4) intrinsics at working size, px."""
+
+    def __post_init__(self) -> None:
+        self.cameras = np.stack([self.size.intrinsics(each) for each in self.intrinsics])
 
     def at(self, frame: int) -> Measured | None:
         """Return the depth of a frame; None where the camera shows no parallax."""
@@ -64,14 +70,14 @@ class MultiviewDepth:
             (
                 self.size.within(other.inverse_depth, np.nan),
                 self.world_T_cam[number],
-                self.size.intrinsics(self.intrinsics),
+                self.cameras[number],
             )
             for number in near
             if 0 <= number < len(self.world_T_cam) and (other := self._raw(number)) is not None
         ]
         averaged = average_over_frames(
-            own.inverse_depth, self.world_T_cam[frame], others, self.size.intrinsics(self.intrinsics),
-            self.config.max_disagreement, self.threads,
+            own.inverse_depth, self.world_T_cam[frame], others, self.cameras[frame], self.config.max_disagreement,
+            self.threads,
         )  # fmt: skip
         evidence = own.evidence.with_neighbors(averaged.agreeing, averaged.seeing)
         sure = self.size.within(confidence(evidence), 0)
@@ -105,17 +111,18 @@ class MultiviewDepth:
         points, pose = self.seen(frame), self.world_T_cam[frame]
         z = world_to_camera(np.broadcast_to(pose, (len(points), 4, 4)), points)[:, 2]
         points, z = points[z > 0], z[z > 0]
-        views = choose_views(frame, self.world_T_cam, points, *self.size.pinhole(self.intrinsics), self.config)
+        cameras, sides = self.cameras, (self.size.height, self.size.width)
+        views = choose_views(frame, self.world_T_cam, points, cameras, sides, self.config)
         if not views:
             return None
-        other_T_cam = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
-        intrinsics = self.size.intrinsics(self.intrinsics)
-        planes = choose_planes(z, other_T_cam, intrinsics, (self.size.height, self.size.width), self.config)
+        there = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
+        transfers = [pixel_transfer(cameras[frame], cameras[view], at) for view, at in zip(views, there, strict=True)]
+        planes = choose_planes(z, transfers, sides, self.config)
         own = self._shown(frame)
-        others = [Shown(self._shown(view).matched, self.world_T_cam[view]) for view in views]
-        factors = exposures(Shown(own.matched, pose), others, points, intrinsics)
+        others = [Shown(self._shown(view).matched, self.world_T_cam[view], cameras[view]) for view in views]
+        factors = exposures(Shown(own.matched, pose, cameras[frame]), others, points)
         matched = [other.gray * np.float32(factor) for other, factor in zip(others, factors, strict=True)]
-        swept = sweep(own.gray, matched, other_T_cam, intrinsics, planes, self.config, self.threads)
+        swept = sweep(own.gray, matched, transfers, planes, self.config, self.threads)
         step = np.float32(planes[1] - planes[0])
         return _Raw(
             self.size.continued(swept.inverse_depth), Evidence.of(swept, step / swept.inverse_depth, len(views))

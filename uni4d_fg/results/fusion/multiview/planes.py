@@ -6,6 +6,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.multiview import MultiviewConfig
+from uni4d_fg.results.fusion.pixel_transfer import PixelTransfer
 
 _SPAN = (0.01, 0.99)
 """Quantiles of the landmarks' inverse depth: single ones may be wrong."""
@@ -14,15 +15,13 @@ _FARTHEST = 0.02
 
 
 def choose_planes(
-    depth: FloatArray, other_T_cam: list[FloatArray], intrinsics: FloatArray, size: tuple[int, int],
-    config: MultiviewConfig,
-) -> FloatArray:  # fmt: skip
+    depth: FloatArray, transfers: list[PixelTransfer], size: tuple[int, int], config: MultiviewConfig
+) -> FloatArray:
     """Return inverse depths, evenly spaced and ascending, (D,) 1/m.
 
     Args:
         depth: (N,) depth of the landmarks that the frame sees, m.
-        other_T_cam: Poses (4, 4) of the frame's camera in those of its views.
-        intrinsics: (4,) px, at working size.
+        transfers: Where the views see the frame's pixels, at working size.
         size: (h, w), px.
         config: Margin and number of planes.
     """
@@ -30,19 +29,17 @@ def choose_planes(
     margin = config.range_margin * (high - low)
     last = high + margin + 0.05 * high
     first = max(low - margin, _FARTHEST * last)
-    travel = max(_travel(pose, intrinsics, size, first, last) for pose in other_T_cam)
+    travel = max(_travel(transfer, size, first, last) for transfer in transfers)
     count = int(np.clip(np.ceil(travel / config.plane_step_px) + 1, config.min_planes, config.max_planes))
     return np.linspace(first, last, count)
 
 
-def _travel(pose: FloatArray, intrinsics: FloatArray, size: tuple[int, int], first: float, last: float) -> float:
+def _travel(transfer: PixelTransfer, size: tuple[int, int], first: float, last: float) -> float:
     """Return how far a pixel moves in another view between two planes: the median over a grid, px."""
-    fx, fy, cx, cy = intrinsics
     u, v = np.meshgrid(np.linspace(0, size[1] - 1, 5), np.linspace(0, size[0] - 1, 5))
-    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1).reshape(-1, 3)
-    turned = rays @ pose[:3, :3].T
+    turned = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ transfer.turn.T
     ends = []
     for rho in (first, last):
-        x = turned + rho * pose[:3, 3]
-        ends.append(np.array([fx, fy]) * x[:, :2] / np.maximum(x[:, 2:], 1e-3))
+        x = turned + rho * transfer.shift
+        ends.append(x[:, :2] / np.maximum(x[:, 2:], 1e-3))
     return float(np.median(np.linalg.norm(ends[1] - ends[0], axis=1)))

@@ -11,7 +11,7 @@ from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.results.fusion.multiview.sweep_numpy import sweep_numpy
-from uni4d_fg.results.fusion.pixel_transfer import pixel_transfer
+from uni4d_fg.results.fusion.pixel_transfer import PixelTransfer
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,7 @@ class Swept:
 def sweep(
     image: Float32Array,
     others: list[Float32Array],
-    other_T_cam: list[FloatArray],
-    intrinsics: FloatArray,
+    transfers: list[PixelTransfer],
     planes: FloatArray,
     config: MultiviewConfig,
     threads: int = 0,
@@ -42,14 +41,12 @@ def sweep(
     Args:
         image: (h, w), 0 to 1, NaN where it is not to be matched.
         others: V images alike.
-        other_T_cam: V poses (4, 4) of the image's camera in theirs.
-        intrinsics: (4,) px, of this size.
+        transfers: Where each of them sees the image's pixels.
         planes: (D,) inverse depth of the planes, 1/m, evenly spaced and ascending.
         config: Window, penalties and noise.
         threads: Of the C++ version; 0 takes all cores.
     """
-    where = [pixel_transfer(intrinsics, intrinsics, pose) for pose in other_T_cam]
-    turns, shifts = (np.stack(parts) for parts in zip(*where, strict=True))
+    turns, shifts = (np.stack(parts) for parts in zip(*transfers, strict=True))
     core, _ = find_extension()
     settings: dict[str, Any] = {
         "radius": config.window_radius_px,

@@ -29,7 +29,7 @@ def choose_views(
         frame: The frame.
         world_T_cam: (T, 4, 4).
         points: (N, 3) world, that the frame sees, m.
-        intrinsics: (4,) px.
+        intrinsics: (T, 4) px.
         image_size: (height, width), px.
         config: Views.
     """
@@ -45,7 +45,7 @@ def choose_views(
         there = points - world_T_cam[other, :3, 3]
         seen_from = there @ world_T_cam[other, :3, :3]
         front = seen_from[:, 2] > 1e-6
-        uv = project(intrinsics, np.where(front[:, None], seen_from, [0.0, 0.0, 1.0]))
+        uv = project(intrinsics[other], np.where(front[:, None], seen_from, [0.0, 0.0, 1.0]))
         inside = front & (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < width) & (uv[:, 1] < height)
         if inside.mean() < config.min_overlap:
             continue

@@ -47,10 +47,6 @@ class WorkingSize:
         fx, fy, cx, cy = intrinsics
         return np.array([fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5])
 
-    def pinhole(self, intrinsics: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
-        """Return intrinsics (4,) and size (height, width), px, of a pinhole that sees what the images show."""
-        return intrinsics, self.image_size
-
     def pixels(self, uv: FloatArray) -> FloatArray:
         """Return image pixels (N, 2) in working pixels."""
         return np.asarray((uv + 0.5) * np.asarray(self.scale) - 0.5, dtype=np.float64)
