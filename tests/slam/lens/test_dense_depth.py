@@ -1,4 +1,4 @@
-"""Dense depth through a lens, and of a camera that zooms: frames are matched, and it is as good as through a pinhole."""
+"""Dense depth through a lens and of a camera that zooms: frames are matched, and it is as good as through a pinhole."""
 
 from __future__ import annotations
 
