@@ -18,6 +18,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, OPENCV_CAMERA, POSE, ZOOM
 from uni4d_fg.geometry.lens import PARAMETERS, Lens, LensModel
 from uni4d_fg.optim.levenberg_marquardt import Hooks
+from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
@@ -164,6 +165,31 @@ def fit_zoom(start: Fitted, config: Config, options: dict[str, float], *, settle
     evidence = (after.initial_energy - after.final_energy) / max(before, 1e-300)
     scene = bundle.moved(start.scene, state, intrinsics)
     return Fitted(CameraModel(intrinsics, zoom=np.exp(zoom - longest)), scene, evidence)
+
+
+def zoom_freedom(scene: GrowingScene, config: Config) -> float:
+    """Return by how much the focal length of some frame is less certain than that of a zoom whose ratios are known.
+
+    Args:
+        scene: Refined at ideal pixels, from which the zoom is undone.
+        config: What the solve reads.
+
+    Raises:
+        SolverError: If the system cannot be solved.
+    """
+    bundle = _Bundle.of(part_of(scene, config.camera.observations, np.ones_like(scene.registered)))
+    problem, state = zoom_problem(
+        bundle.state, bundle.stage.problem.batches, bundle.pixels(CameraModel(scene.intrinsics), config),
+        bundle.frames, config.bundle_adjustment, config.camera,
+    )  # fmt: skip
+    known = camera_marginals(replace(problem).fix(ZOOM), state, bundle.stage.solver)
+    free = camera_marginals(problem, state, bundle.stage.solver)
+    if known is None or free is None:
+        return 1.0
+    first, held = (float(np.sqrt(one.blocks(INTRINSICS, 1)[0, 0, 0])) for one in (free, known))
+    others = np.sqrt(free.blocks(ZOOM, len(bundle.frames))[:, 0, 0])
+    focal = float(state[INTRINSICS][0, 0])
+    return max(1.0, float(np.hypot(first / focal, others.max())) * focal / held)
 
 
 @dataclass(frozen=True)

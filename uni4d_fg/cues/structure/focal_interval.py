@@ -100,12 +100,13 @@ class FocalInterval:
         return replace(self, low=low, high=high)
 
 
-def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInterval:
+def focal_interval(scene: GrowingScene, image_size: tuple[int, int], freedom: float = 1.0) -> FocalInterval:
     """Return the focal lengths that the tracks leave open; a point where they are held.
 
     Args:
         scene: Refined.
         image_size: (height, width), px.
+        freedom: So many times less certain the focal length is, as something else is free, too.
 
     Raises:
         Cancelled: If asked to stop.
@@ -113,6 +114,7 @@ def focal_interval(scene: GrowingScene, image_size: tuple[int, int]) -> FocalInt
     """
     focal = scene.mean_focal
     deviation, noise = _deviation(scene, image_size)
+    deviation, noise = freedom * deviation, freedom**2 * noise
     if deviation == 0.0:
         return FocalInterval(focal, focal)
     if deviation <= OPEN_FOCAL_SIGMA:  # as far as that E(f) is as good as quadratic

@@ -12,6 +12,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import without_rolling_shutter
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
+from uni4d_fg.cues.structure.camera_fit import zoom_freedom
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
@@ -213,7 +214,8 @@ def structure_from_motion(
     focal_sigma = 0.0
     if with_doubts:
         rivals = rivals_of(hypotheses, poses)
-        focal = focal_interval(scene, image_size)
+        freedom = zoom_freedom(scene, config) if free_focal and camera.zoom is not None else 1.0
+        focal = focal_interval(scene, image_size, freedom)
         if free_focal:
             focal = search.holding_rivals(focal, rivals).holding(beside)
             focal_sigma = focal.deviation
