@@ -49,6 +49,8 @@ _SKETCHED = 5000
 _SHORT = {"relative_decrease": 1e-5, "max_iterations": 30}
 _CLOSE = 0.1
 """Starts whose cost is above the least by no more than this part of it are all fitted to the end once."""
+_TIE = 0.02
+"""Costs that differ by less than this part say nothing."""
 _ROUNDS = 5
 _STEPS = 200
 _SETTLED = 0.003
@@ -119,7 +121,10 @@ def find_zoom(
     to_the_end = {"relative_decrease": config.camera.relative_decrease, "max_iterations": _STEPS}
     costs = [judge.cost(one) for one in found]
     close = [one for one, cost in zip(found, costs, strict=True) if cost <= (1.0 + _CLOSE) * min(costs)]
-    best = min((_fitted(one, judge, config, to_the_end) for one in close), key=judge.cost)
+    ends = [_fitted(one, judge, config, to_the_end) for one in close]
+    costs = [judge.cost(one) for one in ends]
+    # Cameras that were grown anew, the last, owe nothing to the plain ones, which are wrong: in a tie they are taken.
+    best = [one for one, cost in zip(ends, costs, strict=True) if cost <= (1.0 + _TIE) * min(costs)][-1]
     for _ in range(1, _ROUNDS):
         if config.camera.zoom == "auto" and judge.better(best, plain)[1] < 0.5:
             return None
