@@ -66,11 +66,6 @@ class PlaneAtInfinity:
         origin = middle + (along[0] - middle @ normal) * normal
         return cls(normal, offset, origin, float(along[0]) - offset, exchanges)
 
-    def points(self, points: FloatArray) -> FloatArray:
-        """Return points (N, 3) in the world that this map makes; those that end behind the cameras are not left out."""
-        moved = (points - self.origin) / ((points @ self.normal - self.offset) / self.scale)[:, None]
-        return moved @ self._mirror if self.exchanges else moved
-
     def cameras(self, world_T_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return cameras (T, 4, 4) in the world that this map makes, and by what their focal lengths grow (T,)."""
         rotation, center = world_T_cam[:, :3, :3], world_T_cam[:, :3, 3]

@@ -127,8 +127,9 @@ class DenseMaps:
     def __post_init__(self) -> None:
         multiview = self.config.multiview
         poses: FloatArray = self.scene["world_T_cam"]
+        cameras = np.stack([self.size.intrinsics(each) for each in self.intrinsics])
         self.multiview = MultiviewDepth(
-            self._working_frame, self.size, self.intrinsics, poses, self._landmarks, multiview, self.threads
+            self._working_frame, self.size, cameras, poses, self._landmarks, multiview, self.threads
         )
 
     def apart(self, first: int, stop: int) -> DenseMaps:
@@ -454,7 +455,8 @@ class DenseMaps:
 
     def _camera(self, frame: int) -> FloatArray:
         """Return intrinsics (4,) at working size."""
-        return self.size.intrinsics(self.intrinsics[frame])
+        camera: FloatArray = self.multiview.cameras[frame]
+        return camera
 
     def _working_frame(self, frame: int) -> WorkingFrame:
         return working_frame(

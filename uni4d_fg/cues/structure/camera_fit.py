@@ -95,6 +95,10 @@ class TrackJudge:
         energy = np.bincount(row, np.log1p(error**2), len(tracks)) / np.maximum(count, 1)
         return np.where(known, energy, np.nan)
 
+    def anew(self, fitted: Fitted) -> Fitted:
+        """Return what was fitted with all tracks triangulated and judged anew, by its camera."""
+        return replace(fitted, scene=scene_of(fitted.camera.ideal_observations(self.real), fitted.scene))
+
     def cost(self, fitted: Fitted) -> float:
         """Return the mean robust energy of all observations, those of tracks whose rays are parallel as well.
 
@@ -146,10 +150,7 @@ def fit_zoom(start: Fitted, config: Config, options: dict[str, float], *, settle
             that is not at its minimum yet is up to a sixth of the energy.
     """
     bundle = _Bundle.of(start.scene)
-    ideal = bundle.pixels(CameraModel(start.scene.intrinsics), config)
-    problem, state = zoom_problem(
-        bundle.state, bundle.stage.problem.batches, ideal, bundle.frames, config.bundle_adjustment, config.camera
-    )
+    problem, state = bundle.with_zoom(config)
     solver = bundle.stage.solver.model_copy(update=options)
     if settled:
         longer = solver.model_copy(update={"max_iterations": _SETTLING * solver.max_iterations})
@@ -159,12 +160,9 @@ def fit_zoom(start: Fitted, config: Config, options: dict[str, float], *, settle
     every = np.arange(len(start.scene.registered))
     zoom = np.interp(every, bundle.frames, state[ZOOM][:, 0])
     zoom = zoom if start.camera.zoom is None else zoom + np.log(start.camera.zoom)
-    intrinsics = state[INTRINSICS][0].copy()
-    longest = float(zoom.max())
-    intrinsics[:2] *= np.exp(longest)
+    camera = CameraModel.of_log_zoom(state[INTRINSICS][0], zoom)
     evidence = (after.initial_energy - after.final_energy) / max(before, 1e-300)
-    scene = bundle.moved(start.scene, state, intrinsics)
-    return Fitted(CameraModel(intrinsics, zoom=np.exp(zoom - longest)), scene, evidence)
+    return Fitted(camera, bundle.moved(start.scene, state, camera.intrinsics), evidence)
 
 
 def zoom_freedom(scene: GrowingScene, config: Config) -> float:
@@ -178,10 +176,7 @@ def zoom_freedom(scene: GrowingScene, config: Config) -> float:
         SolverError: If the system cannot be solved.
     """
     bundle = _Bundle.of(part_of(scene, config.camera.observations, np.ones_like(scene.registered)))
-    problem, state = zoom_problem(
-        bundle.state, bundle.stage.problem.batches, bundle.pixels(CameraModel(scene.intrinsics), config),
-        bundle.frames, config.bundle_adjustment, config.camera,
-    )  # fmt: skip
+    problem, state = bundle.with_zoom(config)
     known = camera_marginals(replace(problem).fix(ZOOM), state, bundle.stage.solver)
     free = camera_marginals(problem, state, bundle.stage.solver)
     if known is None or free is None:
@@ -216,6 +211,13 @@ class _Bundle:
         kernel = config.bundle_adjustment.reprojection_kernel
         noise = MAP.observed(self.sigma_px, weight, kernel, frame, len(self.frames))
         return RealPixels(frame, used.rows()[1], camera.real(used.uv, used.frame), noise)
+
+    def with_zoom(self, config: Config) -> tuple[Problem, State]:
+        """Return the same with a focal length per frame, beside a zoom that was undone."""
+        pixels = self.pixels(CameraModel(self.state[INTRINSICS][0]), config)
+        return zoom_problem(
+            self.state, self.stage.problem.batches, pixels, self.frames, config.bundle_adjustment, config.camera
+        )
 
     def moved(self, scene: GrowingScene, state: State, intrinsics: FloatArray) -> GrowingScene:
         """Return a scene with the cameras of a state; its points are those of before."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, part_of, probing, scene_of
+from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, part_of, probing
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
@@ -153,14 +153,10 @@ def _with_lens(found: Fitted, rival: Fitted, judge: TrackJudge, config: Config) 
     """
     settings = config.camera
     to_the_end = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
-
-    def judged_anew(fitted: Fitted) -> Fitted:
-        return replace(fitted, scene=scene_of(fitted.camera.ideal_observations(judge.real), fitted.scene))
-
     first: LensModel = "RADIAL" if found.camera.lens.model == "RADIAL" else "SIMPLE_RADIAL"
     for _ in range(_LENS_ROUNDS):
         before = found.camera.lens.padded[0]
-        found = judged_anew(fit_lens(found, first, config, to_the_end))
+        found = judge.anew(fit_lens(found, first, config, to_the_end))
         if judge.better(found, rival)[0] < -_HOPELESS:
             return found
         if abs(found.camera.lens.padded[0] - before) < _LENS_STAYS:
@@ -168,4 +164,4 @@ def _with_lens(found: Fitted, rival: Fitted, judge: TrackJudge, config: Config) 
     if first == "RADIAL":
         return found
     richer = fit_lens(found, "RADIAL", config, to_the_end)
-    return found if richer.evidence < _MIN_SECOND_EVIDENCE else judged_anew(richer)
+    return found if richer.evidence < _MIN_SECOND_EVIDENCE else judge.anew(richer)

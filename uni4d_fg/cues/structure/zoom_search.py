@@ -21,7 +21,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_zoom, part_of, probing, scene_of
+from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_zoom, part_of, probing
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_zoom
@@ -38,7 +38,7 @@ _PROBED = 0.25
 _LOUD = 0.015
 """Evidence from which they need not find any: where motion along the view undoes a zoom, its cameras are far away. Up
 to 0.9 % on 19 clips that do not zoom; 2 to 5 % on three that do."""
-_RATIOS = (0.5, 0.7, 1.0, 1.4, 2.0)
+_RATIOS = (0.5, 0.7, 1.4, 2.0)
 """By which the focal length may change along the path, where near and far stay ..."""
 _EXCHANGING_RATIOS = (1.2, 1.4, 1.7, 2.0, 3.0)
 """... and where they are exchanged."""
@@ -113,7 +113,7 @@ def find_zoom(
     found = []
     for trial in trials:
         try:
-            found.append(_fitted(trial, judge, config, _SHORT))
+            found.append(judge.anew(fit_zoom(trial, config, _SHORT)))
         except SolverError:  # That of one start is no reason to do without the others.
             continue
     if not found:
@@ -121,14 +121,14 @@ def find_zoom(
     to_the_end = {"relative_decrease": config.camera.relative_decrease, "max_iterations": _STEPS}
     costs = [judge.cost(one) for one in found]
     close = [one for one, cost in zip(found, costs, strict=True) if cost <= (1.0 + _CLOSE) * min(costs)]
-    ends = [_fitted(one, judge, config, to_the_end) for one in close]
+    ends = [judge.anew(fit_zoom(one, config, to_the_end)) for one in close]
     costs = [judge.cost(one) for one in ends]
     # Cameras that were grown anew, the last, owe nothing to the plain ones, which are wrong: in a tie they are taken.
     best = [one for one, cost in zip(ends, costs, strict=True) if cost <= (1.0 + _TIE) * min(costs)][-1]
     for _ in range(1, _ROUNDS):
         if config.camera.zoom == "auto" and judge.better(best, plain)[1] < 0.5:
             return None
-        before, best = best, _fitted(best, judge, config, to_the_end)
+        before, best = best, judge.anew(fit_zoom(best, config, to_the_end))
         if float(np.ptp(_log_zoom(best) - _log_zoom(before))) < _SETTLED:
             break
     return best
@@ -172,49 +172,33 @@ def _mapped(plain: Fitted, judge: TrackJudge) -> list[Fitted]:
     sketch = TrackJudge(few, judge.sigma_px)
     posed = plain.scene.world_T_cam[plain.scene.registered]
 
-    def best_of(ratios: tuple[float, ...], exchanges: bool) -> Fitted | None:
-        costs: dict[float, float] = {}
-        near = sorted(np.log(ratios))
+    def best_of(ratios: tuple[float, ...], exchanges: bool) -> PlaneAtInfinity | None:
+        tried: dict[float, tuple[float, PlaneAtInfinity]] = {}
+        near = list(np.log(ratios))
         for _ in range(1 + _HALVINGS):
             for log_ratio in near:
                 plane = PlaneAtInfinity.across(posed, float(np.exp(log_ratio)), exchanges=exchanges)
                 if plane is not None:
-                    costs[log_ratio] = sketch.cost(with_plane_at_infinity(plain, plane, sketch))
-            if not costs:
+                    tried[log_ratio] = sketch.cost(_with_plane_at_infinity(plain, plane, sketch)), plane
+            if not tried:
                 return None
-            at = sorted(costs)
-            row = at.index(min(at, key=costs.__getitem__))
-            near = [0.5 * (one + other) for one, other in pairwise(at) if at[row] in (one, other)]
-        plane = PlaneAtInfinity.across(posed, float(np.exp(at[row])), exchanges=exchanges)
-        return None if plane is None else with_plane_at_infinity(plain, plane, judge)
+            at = sorted(tried)
+            best = min(at, key=lambda log_ratio: tried[log_ratio][0])
+            near = [0.5 * (one + other) for one, other in pairwise(at) if best in (one, other)]
+        return tried[best][1]
 
-    found = [best_of(_RATIOS, exchanges=False), best_of(_EXCHANGING_RATIOS, exchanges=True)]
-    return [one for one in found if one is not None]
+    planes = best_of(_RATIOS, exchanges=False), best_of(_EXCHANGING_RATIOS, exchanges=True)
+    return [_with_plane_at_infinity(plain, plane, judge) for plane in planes if plane is not None]
 
 
-def with_plane_at_infinity(plain: Fitted, plane: PlaneAtInfinity, judge: TrackJudge) -> Fitted:
-    """Return the cameras that a projective map makes, with points triangulated anew."""
+def _with_plane_at_infinity(plain: Fitted, plane: PlaneAtInfinity, judge: TrackJudge) -> Fitted:
+    """Return the cameras that a projective map makes of one that does not zoom, with points triangulated anew."""
     scene, frames = plain.scene, np.flatnonzero(plain.scene.registered)
     poses = scene.world_T_cam.copy()
     poses[frames], growth = plane.cameras(poses[frames])
     log_zoom = np.interp(np.arange(len(poses)), frames, np.log(growth))
-    if plain.camera.zoom is not None:
-        log_zoom += _log_zoom(plain)
-    camera = _of_log_zoom(plain.camera.intrinsics, log_zoom)
-    moved = replace(scene, world_T_cam=poses, intrinsics=camera.intrinsics.copy())
-    return Fitted(camera, scene_of(camera.ideal_observations(judge.real), moved))
-
-
-def _of_log_zoom(intrinsics: FloatArray, log_zoom: FloatArray) -> CameraModel:
-    longest = intrinsics.copy()
-    longest[:2] *= np.exp(log_zoom.max())
-    return CameraModel(longest, zoom=np.exp(log_zoom - log_zoom.max()))
-
-
-def _fitted(start: Fitted, judge: TrackJudge, config: Config, options: dict[str, float]) -> Fitted:
-    """Free the zoom, and triangulate and judge all tracks anew."""
-    found = fit_zoom(start, config, options)
-    return replace(found, scene=scene_of(found.camera.ideal_observations(judge.real), found.scene))
+    camera = CameraModel.of_log_zoom(plain.camera.intrinsics, log_zoom)
+    return judge.anew(Fitted(camera, replace(scene, world_T_cam=poses, intrinsics=camera.intrinsics.copy())))
 
 
 def _log_zoom(fitted: Fitted) -> FloatArray:

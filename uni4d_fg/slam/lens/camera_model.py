@@ -27,6 +27,13 @@ class CameraModel:
     focal_sigma: float | None = None
     """Standard deviation of the log focal length where camera motion told it with the rest; else None."""
 
+    @classmethod
+    def of_log_zoom(cls, intrinsics: FloatArray, log_zoom: FloatArray) -> CameraModel:
+        """Return a pinhole whose focal lengths are ``exp(log_zoom)`` (T,) times those of intrinsics (4,), px."""
+        longest = intrinsics.copy()
+        longest[:2] *= np.exp(log_zoom.max())
+        return cls(longest, zoom=np.exp(log_zoom - log_zoom.max()))
+
     @property
     def is_plain(self) -> bool:
         """Whether real and ideal pixels are the same."""

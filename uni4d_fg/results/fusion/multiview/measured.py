@@ -44,8 +44,8 @@ class MultiviewDepth:
 
     frames: Callable[[int], WorkingFrame]
     size: WorkingSize
-    intrinsics: FloatArray
-    """(T, 4) px, of the images."""
+    cameras: FloatArray
+    """(T, 4) intrinsics at working size, px."""
     world_T_cam: FloatArray
     """(T, 4, 4)."""
     seen: Callable[[int], FloatArray]
@@ -54,11 +54,6 @@ class MultiviewDepth:
     threads: int = 0
     raw: dict[int, _Raw | None] = field(default_factory=dict)
     shown: dict[int, WorkingFrame] = field(default_factory=dict)
-    cameras: FloatArray = field(init=False)
-    """(T, 4) intrinsics at working size, px."""
-
-    def __post_init__(self) -> None:
-        self.cameras = np.stack([self.size.intrinsics(each) for each in self.intrinsics])
 
     def at(self, frame: int) -> Measured | None:
         """Return the depth of a frame; None where the camera shows no parallax."""
