@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +13,11 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure import motion
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import structure_from_motion
-from uni4d_fg.cues.structure.passing_thing import is_of_passing_thing
+from uni4d_fg.cues.structure.passing_thing import explains_more, most_left_over, only_seems_to_turn
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, unproject, world_to_camera
 from uni4d_fg.progress import SilentReporter
+from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 from uni4d_fg.slam.stages.observations import Observations
 
 CONFIG = load_config("default", [])
@@ -62,16 +64,23 @@ def passing(seed: int, points: int = 800, sway: float = 0.11, turn: float = 0.06
     return Street(observed(rows).with_min_observations(5), poses, seen_from_bus)
 
 
-def is_passing(street: Street, world_T_cam: np.ndarray, known_focal: bool = False) -> bool:
-    """Judge cameras that see the street."""
+def scene_at(street: Street, world_T_cam: np.ndarray) -> GrowingScene:
+    """Return what cameras make of all tracks."""
     scene = GrowingScene.empty(
         street.observations, FRAMES, K, CONFIG, free_focal=True, prior_intrinsics=GUESS, should_stop=lambda: False
     )
     scene.world_T_cam, scene.registered[:] = world_T_cam.copy(), True
     scene.triangulate_all()
     scene.limit_px[:] = 0.7
-    return is_of_passing_thing(
-        scene, street.observations, SIZE, K if known_focal else GUESS, CONFIG.geometric_depth, known_focal=known_focal
+    return scene
+
+
+def is_passing(street: Street, world_T_cam: np.ndarray, known_focal: bool = False) -> bool:
+    """Judge cameras that see the street."""
+    rest = most_left_over(scene_at(street, world_T_cam), street.observations, SIZE)
+    intrinsics = K if known_focal else GUESS
+    return rest is not None and only_seems_to_turn(
+        rest, FRAMES, intrinsics, CONFIG.geometric_depth, known_focal=known_focal
     )
 
 
@@ -99,6 +108,27 @@ def test_what_most_of_the_tracks_agree_with_is_the_world() -> None:
     assert not is_passing(street, street.bus_T_cam)
 
 
+def test_what_a_thing_leaves_over_is_the_world_if_it_explains_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A start from what passes may win: then the scene that is grown from the rest is taken."""
+    street = passing(0, sway=0.8)
+    of_bus, of_street = (scene_at(street, poses) for poses in (street.bus_T_cam, street.world_T_cam))
+    assert explains_more(of_street, of_bus, street.observations, SIZE)
+    assert not explains_more(of_bus, of_street, street.observations, SIZE)
+    grown = motion._Search._grown
+
+    def bus_first(search: motion._Search, used: Observations, intrinsics: np.ndarray, free: bool) -> object:
+        found = grown(search, used, intrinsics, free)
+        return found if found is None or len(used) < len(street.observations) else replace(found, scene=of_bus)
+
+    monkeypatch.setattr(motion._Search, "_grown", bus_first)
+    config = load_config("default", ["input.intrinsics=fixed", f"geometric_depth.max_tracks={10**6}"])
+    found = structure_from_motion(street.observations, FRAMES, SIZE, K, config, SilentReporter(), lambda: False)
+    assert found is not None
+    right = evaluate_trajectory(found.world_T_cam, street.world_T_cam)
+    assert right.ate_m < 0.01 * np.ptp(street.world_T_cam[:, 1, 3])
+    assert evaluate_trajectory(found.world_T_cam, street.bus_T_cam).ate_m > 10 * right.ate_m
+
+
 def test_without_another_scene_the_camera_only_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     street = passing(0, sway=0.6)
 
@@ -106,5 +136,8 @@ def test_without_another_scene_the_camera_only_turns(monkeypatch: pytest.MonkeyP
         return structure_from_motion(street.observations, FRAMES, SIZE, GUESS, CONFIG, SilentReporter(), lambda: False)
 
     assert found() is not None
-    monkeypatch.setattr(motion, "is_of_passing_thing", lambda *_, **__: True)
+    monkeypatch.setattr(motion, "most_left_over", lambda scene, used, size: used)
+    monkeypatch.setattr(motion, "explains_more", lambda *_: False)
+    assert found() is not None
+    monkeypatch.setattr(motion, "only_seems_to_turn", lambda *_, **__: True)
     assert found() is None

@@ -21,7 +21,7 @@ from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, ranked
 from uni4d_fg.cues.structure.judging import errors_of
-from uni4d_fg.cues.structure.passing_thing import is_of_passing_thing
+from uni4d_fg.cues.structure.passing_thing import explains_more, most_left_over, only_seems_to_turn
 from uni4d_fg.cues.structure.readout import at_one_time, find_readout, is_told_still
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import NEARLY_AS_WELL, Rival, rivals_of
@@ -259,6 +259,18 @@ class _Search:
         """Let starts compete, and grow and trim the best; None if no two frames have parallax, but for what passes."""
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
+        found = self._grown(used, intrinsics, free_focal)
+        rest = None if found is None else most_left_over(found.scene, used, self.image_size)
+        if found is None or rest is None:
+            return found
+        world = replace(self, start=None)._grown(rest, intrinsics, free_focal)
+        if world is not None and explains_more(world.scene, found.scene, used, self.image_size):
+            return replace(world, used=used)
+        turns = only_seems_to_turn(rest, self.num_frames, intrinsics, settings, known_focal=not free_focal)
+        return None if turns else found
+
+    def _grown(self, used: Observations, intrinsics: FloatArray, free_focal: bool) -> _Grown | None:
+        settings = self.config.geometric_depth
         epipolar = epipolar_geometry(used, self.num_frames, self.image_size, settings)
         guess = focal_of_pairs(epipolar.fundamental, self.image_size, intrinsics[2:]) if free_focal else None
         competition = Competition(
@@ -275,8 +287,6 @@ class _Search:
             other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
             if other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, side.pair)]
-        if is_of_passing_thing(scene, used, self.image_size, intrinsics, settings, known_focal=not free_focal):
-            return None
         return _Grown(scene, hypotheses, used)
 
     def _grown_best(

@@ -1,9 +1,12 @@
-"""Whether cameras are those of a thing that passes, while a camera that only turns explains most of the picture.
+"""Whether cameras are those of a thing that passes, while most of the picture is something else.
+
+A ship that passes is full of edges, and what is seen of it agrees better than houses, quay and water do: so a start
+from it may win. Its cameras leave most tracks over, those at the sides of the picture too; where a scene that is grown
+from these explains more, that is the world.
 
 A bus that passes a camera which hardly moves shows far more parallax than the street. Seen from the bus the camera
 moves, the bus is the world, and the street, which only seems to turn, is about as good as infinitely far away: so every
-start leads there. Such cameras explain few tracks to within their noise; what they leave over lies all around, and
-between any two frames a rotation explains it.
+start leads there. Of what such cameras leave over there is no scene: between any two frames a rotation explains it.
 """
 
 from __future__ import annotations
@@ -25,35 +28,45 @@ _TURNED = 5.0
 """Times the least parallax by which what is left over moves, at least: a thing that is fixed to the camera does not."""
 
 
-def is_of_passing_thing(
-    scene: GrowingScene,
-    used: Observations,
-    image_size: tuple[int, int],
-    intrinsics: FloatArray,
-    config: GeometricDepthConfig,
-    *,
-    known_focal: bool,
-) -> bool:
-    """Tell whether the cameras of a grown scene are those of a thing that passes a camera that only turns.
+def most_left_over(scene: GrowingScene, used: Observations, image_size: tuple[int, int]) -> Observations | None:
+    """Return what the cameras of a grown scene leave over; None where that is not most of what is seen.
 
     Args:
         scene: Grown and trimmed.
         used: Observations of tracks all over the picture.
         image_size: (height, width), px.
+    """
+    over = _left_over(scene, used)
+    if _part(over, used) > _MOST and _part(over, used, at_sides(used, image_size)) > _MOST:
+        return used.select(over)
+    return None
+
+
+def explains_more(scene: GrowingScene, other: GrowingScene, used: Observations, image_size: tuple[int, int]) -> bool:
+    """Tell whether a scene leaves over less than another, of all tracks and of those at the sides of the picture."""
+    ours, theirs = _left_over(scene, used), _left_over(other, used)
+    sides = at_sides(used, image_size)
+    return _part(ours, used) < _part(theirs, used) and _part(ours, used, sides) < _part(theirs, used, sides)
+
+
+def only_seems_to_turn(
+    rest: Observations, num_frames: int, intrinsics: FloatArray, config: GeometricDepthConfig, *, known_focal: bool
+) -> bool:
+    """Tell whether a rotation explains what cameras leave over: then the camera turns, and they are a thing's.
+
+    Args:
+        rest: What is left over.
+        num_frames: T.
         intrinsics: (4,) px.
         config: Thresholds.
         known_focal: Whether the focal lengths are exact; else they are sought anew.
     """
-    over = _left_over(scene, used)
-    if not (_is_most(over, used) and _is_most(over, used, at_sides(used, image_size))):
-        return False
-    rest, frames = used.select(over), len(scene.registered)
-    pairs = rank_pairs(rest, frames, intrinsics, config, known_focal=known_focal)
+    pairs = rank_pairs(rest, num_frames, intrinsics, config, known_focal=known_focal)
     if any(has_parallax(pair, config) for pair in pairs):
         return False
     moved = [
         float(np.median(np.linalg.norm(seen.uv_second - seen.uv_first, axis=1)))
-        for seen in common_pixels(rest, frames, config.sampled_frames, config)
+        for seen in common_pixels(rest, num_frames, config.sampled_frames, config)
     ]
     return max(moved, default=0.0) >= _TURNED * config.min_parallax_px
 
@@ -66,8 +79,7 @@ def _left_over(scene: GrowingScene, used: Observations) -> BoolArray:
     return np.asarray(over[row])
 
 
-def _is_most(over: BoolArray, used: Observations, where: BoolArray | None = None) -> bool:
-    """Tell whether most tracks are left over, of all or of those whose observations (N,) are chosen."""
+def _part(over: BoolArray, used: Observations, where: BoolArray | None = None) -> float:
+    """Return the part of the tracks that is left over, of all or of those whose observations (N,) are chosen."""
     inside = np.ones(len(over), dtype=bool) if where is None else where
-    tracks = len(np.unique(used.track[inside]))
-    return len(np.unique(used.track[inside & over])) > _MOST * tracks
+    return len(np.unique(used.track[inside & over])) / max(len(np.unique(used.track[inside])), 1)
