@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.cues.camera_noise import CameraNoise
 from uni4d_fg.cues.moving_parallax import moving_parallax, regress
 from uni4d_fg.cues.moving_things import Sightings, place_moving, weigh
+from uni4d_fg.factors.static_reprojection import static_reprojection_jacobian
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.geometry import se3
 
 FRAMES, FOCAL, SIZE = 40, 400.0, (240, 320)
 INTRINSICS = np.array([FOCAL, FOCAL, 160.0, 120.0])
 TIME = np.arange(FRAMES) / 15.0
+EXACT = CameraNoise(np.zeros((FRAMES, 3, 3)), 0.0)
 
 
 def camera(tremor_m: float) -> FloatArray:
@@ -46,7 +50,7 @@ def seen(middle: FloatArray, centers: FloatArray, noise_px: float, seed: int = 0
 def test_the_cameras_shake_shows_how_far_a_moving_thing_is(seed: int) -> None:
     centers = camera(0.006)
     tracks = seen(thing(), centers, 0.1, seed)
-    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS)
+    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS, EXACT)
     assert found.first == 0
     assert found.size.shape == (FRAMES,)
     assert found.inverse_depth == pytest.approx(0.5, rel=0.1)
@@ -56,23 +60,71 @@ def test_the_cameras_shake_shows_how_far_a_moving_thing_is(seed: int) -> None:
 def test_a_camera_that_moves_evenly_shows_nothing_of_it() -> None:
     centers = camera(0.0)
     tracks = seen(thing(), centers, 0.1)
-    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS)
+    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS, EXACT)
     assert found.sigma > 10 * abs(0.5)
 
 
 def test_errors_of_the_image_do_not_bias_the_regression() -> None:
     estimates = [
         regress(-0.5 * camera(0.006)[:, :2] + np.random.default_rng(seed).normal(0, 3e-3, (FRAMES, 2)),
-                camera(0.006)[:, :2])[0]
+                camera(0.006)[:, :2], np.zeros((FRAMES, 2)), 0.0)[0]
         for seed in range(200)
     ]  # fmt: skip
     assert np.mean(estimates) == pytest.approx(0.5, abs=4 * np.std(estimates) / np.sqrt(200))
 
 
+@pytest.mark.parametrize(("sigma_m", "is_open"), [(0.0012, False), (0.004, True)])
+def test_errors_of_the_cameras_are_not_taken_for_shake(sigma_m: float, is_open: bool) -> None:
+    """A camera that is wrong in position turns so that what stands 5 m away stays: things seem to be there, too."""
+    behind, found = 0.2, []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        wrong = rng.normal(0, sigma_m, (FRAMES, 2))
+        centers = camera(0.006)[:, :2]
+        path = -0.5 * centers - behind * wrong + rng.normal(0, 2e-4, (FRAMES, 2))
+        variance = np.full((FRAMES, 2), sigma_m**2)
+        trusting = regress(path, centers + wrong, np.zeros((FRAMES, 2)), behind)
+        found.append((*trusting, *regress(path, centers + wrong, variance, behind)))
+    trusted, trusted_sigma, u, sigma = np.array(found).T
+    if is_open:
+        assert np.mean(np.abs(trusted - 0.5) > 4 * trusted_sigma) > 0.9  # wrong, and sure of it
+        assert np.mean(np.isinf(sigma)) > 0.9
+    else:
+        assert np.mean(np.abs(u - 0.5) < 2 * sigma) > 0.95
+        assert abs(u.mean() - 0.5) < 0.3 * abs(trusted.mean() - 0.5)
+
+
+def test_cameras_are_as_exact_as_is_told(rng: np.random.Generator) -> None:
+    """Poses that are found again and again from known points spread as the covariance says."""
+    points = np.stack([rng.uniform(-2, 2, 80), rng.uniform(-1.5, 1.5, 80), rng.uniform(3, 8, 80)], axis=1)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = se3.so3_exp(np.array([0.1, -0.2, 0.05])), [0.3, -0.1, 0.2]
+    x = (points - pose[:3, 3]) @ pose[:3, :3]
+    uv = FOCAL * x[:, :2] / x[:, 2:] + INTRINSICS[2:]
+
+    def seen_as(pixels: np.ndarray) -> Tracks:
+        return Tracks(pixels[:, None].astype(np.float32), np.ones((80, 1), bool), np.zeros(80, np.int32))
+
+    centers = []
+    for _ in range(300):
+        noisy, found = uv + rng.normal(0, 0.3, uv.shape), pose
+        for _ in range(3):
+            at = np.broadcast_to(found, (80, 4, 4)), points, np.broadcast_to(INTRINSICS, (80, 4))
+            residual, (by_pose, *_) = static_reprojection_jacobian(*at, uv=noisy)
+            step = np.linalg.lstsq(by_pose.reshape(-1, 6), -residual.ravel(), rcond=None)[0]
+            found = found @ se3.se3_exp(step)
+        centers.append(found[:3, 3])
+    told = CameraNoise.of_points(np.arange(80), points, seen_as(noisy), found[None], INTRINSICS)
+    np.testing.assert_allclose(np.sqrt(np.diag(told.covariance[0])), np.std(centers, axis=0), rtol=0.35)
+    assert told.inverse_depth == pytest.approx(float(np.median(1 / x[:, 2])), rel=0.02)
+    few = CameraNoise.of_points(np.arange(5), points[:5], seen_as(noisy), found[None], INTRINSICS)
+    assert np.isinf(np.diag(few.covariance[0])).all()
+
+
 def test_the_apparent_size_follows_a_thing_that_comes_near() -> None:
     centers, middle = camera(0.006), thing(speed_z=-0.3)
     tracks = seen(middle, centers, 0.1)
-    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS)
+    (found,) = moving_parallax(tracks.uv.astype(np.float64), tracks.visible, poses(centers), INTRINSICS, EXACT)
     z = (middle - centers)[:, 2]
     at_one = found.size * z
     assert at_one.std() / at_one.mean() < 0.01
@@ -117,7 +169,7 @@ def test_a_thing_that_floats_is_put_nearer_than_what_is_below_it() -> None:
     middle = thing(speed_z=-0.2)
     tracks = seen(middle, centers, 0.1)
     contacts = tuple({3: 0.2} for _ in range(FRAMES))
-    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS)
+    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS, EXACT)
     z = 1 / np.array([values[3] for values in placed.inverse_depth])
     np.testing.assert_allclose(z, (middle - centers)[:, 2], rtol=0.12)
     assert placed.nearer[3] == pytest.approx(2.7, rel=0.1)
@@ -128,12 +180,12 @@ def test_without_shake_it_stays_where_it_may_stand_and_a_thing_that_is_cut_off_i
     centers = camera(0.0)
     tracks = seen(thing(), centers, 0.1)
     contacts = tuple({3: 0.2} for _ in range(FRAMES))
-    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS)
+    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS, EXACT)
     # It keeps its distance, as its apparent size tells with noise of its own.
     np.testing.assert_allclose([values[3] for values in placed.inverse_depth], 0.2, rtol=2e-3)
     assert not placed.nearer
     assert not placed.open
-    cut = place_moving(contacts, sightings(tracks, slice(0, 240)), tracks, poses(centers), INTRINSICS)
+    cut = place_moving(contacts, sightings(tracks, slice(0, 240)), tracks, poses(centers), INTRINSICS, EXACT)
     assert cut.open == [3]
     assert not cut.nearer  # that it is nearer than what is seen below is a guess
 
@@ -145,7 +197,7 @@ def test_frames_whose_masks_lose_feet_follow_the_others_by_apparent_size() -> No
     # It stands where its mask ends, but in three of five frames that ends higher.
     lost = np.where(np.arange(FRAMES) % 5 > 1, 0.7, 1.0)
     contacts = tuple({3: value} for value in (lost / z).tolist())
-    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS)
+    placed = place_moving(contacts, sightings(tracks, slice(0, 239)), tracks, poses(centers), INTRINSICS, EXACT)
     found = 1 / np.array([values[3] for values in placed.inverse_depth])
     np.testing.assert_allclose(found, z, rtol=0.02)
 
@@ -157,7 +209,14 @@ def test_things_without_tracks_and_frames_without_things_are_left_alone() -> Non
         mask = np.zeros(SIZE, dtype=np.int32)
         mask[50:60] = 2 * (frame > 0)
         found.add(frame, mask)
-    placed = place_moving(({}, {2: 0.3}, {2: 0.4}), found, nothing, np.tile(np.eye(4), (3, 1, 1)), INTRINSICS)
+    placed = place_moving(
+        ({}, {2: 0.3}, {2: 0.4}),
+        found,
+        nothing,
+        np.tile(np.eye(4), (3, 1, 1)),
+        INTRINSICS,
+        CameraNoise(np.zeros((3, 3, 3)), 0.0),
+    )
     assert placed.inverse_depth == ({}, {2: 0.3}, {2: 0.4})
 
 

@@ -17,6 +17,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray, rows_
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.borrowed_points import beside_masks, with_borrowed
+from uni4d_fg.cues.camera_noise import CameraNoise
 from uni4d_fg.cues.ground_plane import Ground, find_ground
 from uni4d_fg.cues.interpolated_depth import (
     InterpolatedDepths,
@@ -311,7 +312,10 @@ def _place(
     depths = replace(depths, grids=tuple(grids))
     contacts = smooth_over_time(standing, depths.config.contact_smoothing)
     ideal = structure.camera.ideal_tracks(tracks)
-    placed = place_moving(contacts, sightings, ideal, structure.world_T_cam, structure.intrinsics)
+    still = ~structure.moving
+    cameras = structure.world_T_cam, structure.intrinsics
+    noise = CameraNoise.of_points(structure.track[still], structure.points.position[still], ideal, *cameras)
+    placed = place_moving(contacts, sightings, ideal, *cameras, noise)
     facts = [
         f"moving thing {label} is {ratio:.1f} times nearer than what is seen below it, as the camera's shake tells"
         for label, ratio in placed.nearer.items()

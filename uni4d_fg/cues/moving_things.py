@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray, at_nearest_pixel
+from uni4d_fg.cues.camera_noise import CameraNoise
 from uni4d_fg.cues.interpolated_depth import NEAREST_SHARE
 from uni4d_fg.cues.moving_parallax import Parallax, moving_parallax
 from uni4d_fg.frontend.track_model import Tracks
@@ -31,7 +32,7 @@ _LOG_RATIO = np.arange(-0.6, np.log(_NEAREST), 0.01)
 _TOO_SURE = 1.3
 """Standard deviations of the parallax are this much too small, on synthetic scenes ..."""
 _SHARED = 0.08
-"""... and cameras that are not exact bias it by up to this part."""
+"""... and cameras that are not exact bias it by up to this part besides."""
 _MODEL_WRONG = 0.1
 """Probability that a thing is not as smooth as it is taken to be: parallax then shows any ratio up to the nearest."""
 _ON_IT = 0.5
@@ -89,6 +90,7 @@ def place_moving(
     tracks: Tracks,
     world_T_cam: FloatArray,
     intrinsics: FloatArray,
+    noise: CameraNoise,
 ) -> Placed:
     """Decide where things are.
 
@@ -98,6 +100,7 @@ def place_moving(
         tracks: Those of the sightings, at the pixels of a pinhole that does not zoom.
         world_T_cam: (T, 4, 4).
         intrinsics: (4,) px.
+        noise: Errors of the cameras.
     """
     placed = [dict(contact) for contact in contacts]
     nearer: dict[int, list[float]] = {}
@@ -108,7 +111,7 @@ def place_moving(
         stretches = list[Parallax]()
         if np.count_nonzero(mine) >= _MIN_TRACKS:
             uv = tracks.uv[mine].astype(np.float64)
-            stretches = moving_parallax(uv, tracks.visible[mine], world_T_cam, intrinsics)
+            stretches = moving_parallax(uv, tracks.visible[mine], world_T_cam, intrinsics, noise)
         shown = False
         for parallax in stretches:
             frames = [
