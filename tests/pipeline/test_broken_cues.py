@@ -1,4 +1,4 @@
-"""Frames whose cue shows nothing: named, and their depth about as good as that of the other frames."""
+"""Frames whose cue shows nothing: named, as good as the others, and no measure of where moving points are."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from pipeline_scenes import make_config
 
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.frontend.synthetic.simulate import make_synthetic_sequence
+from uni4d_fg.frontend.track_model import TrackLabel
 from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.pipeline.compare.comparison import stage_arrays
+from uni4d_fg.pipeline.steps import correct_cue, frozen_cameras
 from uni4d_fg.results.depth_store import read_depth
+from uni4d_fg.results.labels_io import load_labels
 from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.stages.observations import observations_of
 
 BROKEN = (4, 9)
 FRAMES = 13
@@ -37,3 +42,9 @@ def test_broken_frames_are_as_good_as_others(tmp_path: Path) -> None:
     assert np.median(error) < 0.025
     assert error[list(BROKEN)].max() < 1.1 * np.median(error)
     assert stage["matched_frames"] == FRAMES
+    config, labelled = make_config(), load_labels(RunFolder(tmp_path).labels)
+    scene = stage_arrays(tmp_path, "bundle_adjustment")
+    moving = observations_of(labelled, TrackLabel.DYNAMIC)
+    assert np.isfinite(moving.depth[np.isin(moving.frame, BROKEN)]).all()
+    corrected, *_ = correct_cue(moving, labelled, *frozen_cameras(scene), scene, config)
+    np.testing.assert_array_equal(np.isnan(corrected.depth), np.isnan(moving.depth) | np.isin(moving.frame, BROKEN))

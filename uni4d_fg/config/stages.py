@@ -225,12 +225,13 @@ class NonRigidConfig(Section):
     )
     local_scale_neighbors: int = setting(
         32,
-        "The depth cue at a moving point is scaled by the median over this many nearest static observations, where "
-        "that predicts better than the frame's scale; 0 always takes the frame's scale.",
+        "The depth cue at a moving point is corrected by the frame's shift of disparity and by the median over this "
+        "many nearest static observations, the less the farther they are, where that predicts better than the "
+        "frame's scale; 0 always takes the frame's scale.",
         ge=0,
     )
     local_scale_samples: int = setting(
-        512, "Static observations per frame on which that prediction is measured, at most.", ge=8
+        512, "Predictions of static observations per frame and direction on which that is measured, at most.", ge=8
     )
     reprojection: bool = setting(True, "Use E_NR.")
     depth_prior: bool = setting(True, "Use the depth prior.", basic=True)

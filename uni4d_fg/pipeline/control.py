@@ -14,8 +14,8 @@ from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.pipeline.landmark_sigma import landmark_shares
 from uni4d_fg.pipeline.steps import Arrays
-from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.densify import ControlPoints
+from uni4d_fg.slam.stages.contradicting_depth import contradicting_frames
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def static_control(
         points: FloatArray = scene["landmarks"][seen]
         instance: Int32Array = np.zeros(len(points), dtype=np.int32)
         frames.append(_points(labelled, track[seen], points, instance, shares[seen], frame, pose))
-    return StaticControl(frames, contradicting_frames(frames, config))
+    return StaticControl(frames, contradicting_frames([(points.cue, points.log_scale) for points in frames], config))
 
 
 def with_moving(

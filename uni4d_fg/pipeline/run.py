@@ -18,7 +18,6 @@ from uni4d_fg.allocation import LARGE, return_free_memory
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.load import dump_config
 from uni4d_fg.config.models import Config
-from uni4d_fg.config.rigid_objects import RigidObjectsConfig
 from uni4d_fg.counted import counted
 from uni4d_fg.cues.depth_settings import settings_of_judgment
 from uni4d_fg.cues.mask_repair import RepairedMasks, repair_masks, repair_warnings
@@ -313,7 +312,7 @@ def _stages(
             scene = run.step(
                 "bundle_adjustment", key, lambda hooks: with_loops(loops, scene_step(parts, before, hooks))
             )
-            key = stage_key(key, config.nonrigid, *_searched(config))
+            key = stage_key(key, *_of_motion(config))
             after = key
             if run.workers is not None:
                 static.begin(scene)  # while they solve windows this process is idle
@@ -328,7 +327,7 @@ def _stages(
             bundle_adjustment_step(sequence, labelled, cameras, config, hooks, run_stage, run.imu, fragments),
         ),
     )
-    key = stage_key(key, config.nonrigid, *_searched(config))
+    key = stage_key(key, *_of_motion(config))
     motion = run.step(
         "nonrigid",
         key,
@@ -344,9 +343,11 @@ def _stages(
     return key, both, both
 
 
-def _searched(config: Config) -> list[RigidObjectsConfig]:
-    """Return the settings of the search for rigid objects, if there is one: those of none change no result."""
-    return [config.rigid_objects] if config.rigid_objects.enabled else []
+def _of_motion(config: Config) -> list[object]:
+    """Return the settings of stage 3, those of cues that it does without, and those of rigid objects if any."""
+    fusion = config.fusion
+    judged = [fusion.broken_ratio, fusion.broken_share, fusion.min_broken_frames, fusion.min_control_points]
+    return [config.nonrigid, *judged, *([config.rigid_objects] if config.rigid_objects.enabled else [])]
 
 
 def _repair_masks(run: RunInProgress, key: str) -> str:

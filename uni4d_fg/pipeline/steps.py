@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import FloatArray, IntArray
+from uni4d_fg.arrays import FloatArray, IntArray, rows_by_group
 from uni4d_fg.config.models import Config
 from uni4d_fg.config.solver import KernelConfig
 from uni4d_fg.config.stages import BundleAdjustmentConfig, CameraMotionConfig
@@ -33,6 +33,7 @@ from uni4d_fg.pipeline.summary import solve_dict
 from uni4d_fg.pipeline.warnings import scene_warnings, started_from_a_guess, unmasked_motion_warnings
 from uni4d_fg.slam.measurements.imu_start import start_with_imu
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
+from uni4d_fg.slam.stages.contradicting_depth import contradicting_frames
 from uni4d_fg.slam.stages.depth_spread import depth_spread
 from uni4d_fg.slam.stages.energy import Normalization, PaperEnergy, energy_of
 from uni4d_fg.slam.stages.local_scale import predict_log_scale
@@ -322,6 +323,11 @@ def correct_cue(
     static, row = landmark_observations(labelled, scene)
     z = seen_from(cameras.world_T_cam, static.frame, scene["landmarks"][row])[:, 2]
     measured = np.log(np.maximum(z, NEAR_PLANE)) - np.log(static.depth)
+    # A constant cue where something moves would pull it away, and smoothness the frames beside with it.
+    of_frames = rows_by_group(static.frame, len(cameras.log_scale))
+    seen = [(static.depth[rows].astype(np.float64), measured[rows]) for rows in of_frames]
+    broken = np.isin(observations.frame, contradicting_frames(seen, config.fusion))
+    observations = replace(observations, depth=np.where(broken, np.nan, observations.depth))
     neighbors, samples = config.nonrigid.local_scale_neighbors, config.nonrigid.local_scale_samples
     local = predict_log_scale(static, measured, cameras.log_scale, observations, neighbors, samples)
     fact = f"depth cue scaled per {'neighborhood' if local.is_local else 'frame'}, noise {100 * local.sigma:.1f} %"

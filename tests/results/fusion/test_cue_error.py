@@ -1,26 +1,22 @@
-"""What is wrong with a cue is measured and taken out of it, and a frame that contradicts the scene is found."""
+"""What is wrong with a cue is measured and taken out of it."""
 
 from __future__ import annotations
-
-import dataclasses
 
 import cv2
 import numpy as np
 import pytest
 
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.results.fusion.broken_frames import contradicting_frames
 from uni4d_fg.results.fusion.cue_error import (
     KnownDepth,
     correct_cue,
-    fit_affine,
     smooth_field,
     smooth_field_of_points,
 )
-from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.results.fusion.multiview.measured import Measured
 from uni4d_fg.results.fusion.static_depth import fuse_static, held_out_errors, known_depth, without_edges
 from uni4d_fg.results.nearest import from_nearest
+from uni4d_fg.slam.stages.affine_error import fit_affine
 
 HEIGHT, WIDTH = 60, 80
 NOWHERE = np.zeros((HEIGHT, WIDTH), bool)
@@ -105,60 +101,6 @@ def test_a_frame_without_anything_known_keeps_its_scale() -> None:
     nothing = KnownDepth(np.full_like(cue, np.nan), np.zeros_like(cue))
     corrected = correct_cue(cue, nothing, 0.1, FusionConfig())
     np.testing.assert_allclose(corrected.log_depth, np.log(2.0) + 0.1, rtol=1e-6)
-
-
-def frames(rng: np.random.Generator, broken: set[int], count: int = 12) -> list[ControlPoints]:
-    out = []
-    for frame in range(count):
-        depth = rng.uniform(1.0, 4.0, 200)
-        cue = 1.0 / (rng.uniform(0.8, 1.2) / depth + 0.02) * np.exp(0.05 * rng.standard_normal(200))
-        if frame in broken:
-            cue = np.full(200, 2.0) if frame % 2 else rng.uniform(1.0, 4.0, 200)
-        log_scale = np.log(depth) - np.log(cue)
-        out.append(ControlPoints(np.zeros((200, 2)), cue, log_scale, np.zeros(200, np.int32), np.zeros((200, 3))))
-    return out
-
-
-def test_frames_that_contradict_the_scene_are_named_and_no_other(rng: np.random.Generator) -> None:
-    assert contradicting_frames(frames(rng, {3, 8}), FusionConfig()) == [3, 8]
-    assert contradicting_frames(frames(rng, set()), FusionConfig()) == []
-
-
-def test_a_constant_cue_before_a_wall_is_named(rng: np.random.Generator) -> None:
-    """Most landmarks are on the wall, for which a constant depth is as good as any; what stands before it tells."""
-    control = frames(rng, set())
-    for frame, points in enumerate(control):
-        wall = rng.uniform(3.9, 4.1, 200)
-        depth = np.where(np.arange(200) < 40, rng.uniform(1.0, 2.0, 200), wall)
-        cue = np.full(200, 4.0) if frame == 5 else depth * np.exp(0.05 * rng.standard_normal(200))
-        control[frame] = dataclasses.replace(points, cue=cue, log_scale=np.log(depth / cue))
-    assert contradicting_frames(control, FusionConfig()) == [5]
-
-
-def test_a_constant_cue_is_named_where_all_is_about_as_far_and_other_cues_err_by_as_much(
-    rng: np.random.Generator,
-) -> None:
-    control = frames(rng, set())
-    for frame, points in enumerate(control):
-        depth = rng.uniform(3.8, 4.2, 200)
-        cue = np.full(200, 4.0) if frame == 5 else depth * np.exp(0.05 * rng.standard_normal(200))
-        if frame == 7:  # a wall that is seen straight on and nothing else: flat, and right
-            depth, cue = 4.0 * np.exp(0.002 * rng.standard_normal(200)), 4.0 + 1e-4 * np.linspace(-1.0, 1.0, 200)
-        control[frame] = dataclasses.replace(points, cue=cue, log_scale=np.log(depth / cue))
-    assert contradicting_frames(control, FusionConfig()) == [5]
-
-
-def test_samples_that_err_alike_do_not_make_up_a_shift(rng: np.random.Generator) -> None:
-    """A smooth error looks like a shift over a small range of depth, and things nearer than that pay for it."""
-    error = {np.inf: 0.0, 0.08: 0.0}
-    for _ in range(20):
-        depth = rng.uniform(2.8, 3.6, 400)
-        slope = 0.08 * rng.standard_normal()
-        cue = depth * np.exp(slope * (depth - 3.2) / 0.4 + 0.02 * rng.standard_normal(400))
-        for shift_sigma in error:
-            a, b, _spread = fit_affine(cue, np.log(depth), np.ones(400), shift_sigma)
-            error[shift_sigma] += abs(float(np.log((a / 1.6 + b) * 1.6))) / 20
-    assert error[0.08] < 0.75 * error[np.inf]
 
 
 def test_held_out_landmarks_tell_the_error_of_the_cue_and_which_depth_is_better(rng: np.random.Generator) -> None:

@@ -36,6 +36,16 @@ def test_trajectories_correct_an_instance_and_nothing_else(rng: np.random.Genera
     np.testing.assert_array_equal(few, given)
 
 
+def test_points_that_disagree_move_an_instance_less(rng: np.random.Generator) -> None:
+    pixels, truth, _ = scene()
+    places = np.argwhere(pixels)[rng.choice(pixels.sum(), 12, replace=False)]
+    uv, right = places[:, ::-1].astype(np.float64), truth[places[:, 0], places[:, 1]].astype(np.float64)
+    agreeing = correct_moving(truth, pixels, uv, right - 0.1, 0.0, FusionConfig())
+    torn = correct_moving(truth, pixels, uv, right - np.linspace(0.0, 0.8, 12), 0.0, FusionConfig())
+    assert np.abs(agreeing - truth)[pixels].mean() > 0.095
+    assert np.abs(torn - truth)[pixels].mean() < 0.04
+
+
 def test_what_a_cue_mixes_in_is_taken_out() -> None:
     pixels, truth, bled = scene(blur_px=8)
     before = np.abs(bled - truth)[pixels].mean()

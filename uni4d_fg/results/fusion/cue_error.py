@@ -11,7 +11,6 @@ left over Gaussian windows, wide ones first, each shrunk towards the one before 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -19,17 +18,10 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.wide_window import averaged, nodes, resized, sigma_on
-from uni4d_fg.robust import MAD_TO_SIGMA
+from uni4d_fg.slam.stages.affine_error import SHIFT_SIGMA, fit_affine
 
 _MAX_SAMPLES = 4000
-_ITERATIONS = 12
-_SETTLED = 1e-4
-"""Relative change of an affine error that is no change."""
 _MIN_SAMPLES = 12
-_SHIFT_SIGMA = 0.08
-"""Standard deviation of the shift, of the median inverse depth, before anything is seen."""
-_INDEPENDENT = 30
-"""The smooth error makes samples alike: all of a frame say no more than this many on their own."""
 _FARTHEST = 0.02
 """Least inverse depth, of the median one."""
 
@@ -66,56 +58,6 @@ class CorrectedCue:
         return _affine_log_depth(cue, self.scale, self.shift, self.least_inverse)
 
 
-def fit_affine(
-    cue: FloatArray, log_depth: FloatArray, weight: FloatArray, shift_sigma: float = np.inf
-) -> tuple[float, float, float]:
-    """Fit ``1 / z = a / cue + b`` robustly.
-
-    Args:
-        cue: (N,) m, positive.
-        log_depth: (N,) of the same pixels.
-        weight: (N,) not negative.
-        shift_sigma: Standard deviation of the shift before anything is seen, of the median inverse depth.
-
-    Returns:
-        a, b, and the robust standard deviation of the log depth that is left. A line that falls, or that makes depth
-        negative, is replaced by a scale alone.
-    """
-    inverse, wanted = 1.0 / cue, np.exp(-log_depth)
-    median = partial(_weighted_median, weight=None if weight.min() == weight.max() > 0 else weight)
-    scale = float(np.exp(-median(log_depth - np.log(cue))))
-    typical, nearest, farthest = float(np.median(wanted)), float(inverse.min()), float(wanted.min())
-    a, b = scale, 0.0
-    # Relative residuals: an error of inverse depth counts by how deep it is.
-    relative, mass = weight / wanted**2, float(weight.sum())
-    left = _log_left(a, b, inverse, log_depth)
-    for _ in range(_ITERATIONS):
-        sigma = max(MAD_TO_SIGMA * median(np.abs(left)), 1e-4)
-        w = relative / (1.0 + (left / (2.0 * sigma)) ** 2) ** 2
-        # One more sample, of no inverse depth at none: without evidence there is no shift.
-        least = (sigma / (shift_sigma * typical)) ** 2 * mass / _INDEPENDENT
-        total = float(w.sum()) + least
-        x, y = float(w @ inverse) / total, float(w @ wanted) / total
-        away = inverse - x
-        weighted = w * away
-        spread = float(weighted @ away) + least * x**2
-        slope = (float(weighted @ (wanted - y)) + least * x * y) / max(spread, 1e-12 * total)
-        shift = y - slope * x
-        if slope <= 0.2 * scale or slope > 5.0 * scale or slope * nearest + shift <= 0.1 * farthest:
-            slope, shift = scale, 0.0
-        done = abs(slope - a) + abs(shift - b) < _SETTLED * (abs(a) + abs(b))
-        a, b = slope, shift
-        left = _log_left(a, b, inverse, log_depth)
-        if done:
-            break
-    return a, b, MAD_TO_SIGMA * median(np.abs(left))
-
-
-def _log_left(a: float, b: float, inverse: FloatArray, log_depth: FloatArray) -> FloatArray:
-    left: FloatArray = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
-    return left
-
-
 def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, config: FusionConfig) -> CorrectedCue:
     """Take affine and smooth errors out of a cue.
 
@@ -137,7 +79,7 @@ def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, 
         cue[at].astype(np.float64),
         known.log_depth[at].astype(np.float64),
         known.weight[at].astype(np.float64),
-        _SHIFT_SIGMA,
+        SHIFT_SIGMA,
     )
     least = _least_inverse(cue, a, b)
     log_depth = _affine_log_depth(cue, a, b, least)
@@ -211,13 +153,3 @@ def _field(mass: Float32Array, pull: Float32Array, shape: tuple[int, ...], confi
         around = cv2.GaussianBlur(np.dstack((mass, pull - mass * field)), (0, 0), on_grid)
         field = field + around[..., 1] / (around[..., 0] + np.float32(config.field_prior))
     return resized(field, shape)
-
-
-def _weighted_median(values: FloatArray, weight: FloatArray | None) -> float:
-    """Return the lower weighted median; without weights, all count alike."""
-    if weight is None:
-        middle = (len(values) - 1) // 2
-        return float(np.partition(values, middle)[middle])
-    order = np.argsort(values)
-    mass = np.cumsum(weight[order])
-    return float(values[order[min(int(np.searchsorted(mass, 0.5 * mass[-1])), len(values) - 1)]])

@@ -16,11 +16,17 @@ from uni4d_fg.cues.dense_flow import DenseFlow, shrunk_gray, warp_back
 from uni4d_fg.results.fusion.carried import filled_smoothly
 from uni4d_fg.results.fusion.cue_error import smooth_field_of_points
 from uni4d_fg.results.fusion.wide_window import blurred
+from uni4d_fg.robust import robust_sigma
 
 _POINT_WEIGHT = 0.5
 """Of a trajectory's point, where a window full of sure pixels has one per pixel."""
 _WRONG = 0.25
 """A point whose log depth departs farther from the instance's usual departure is wrong."""
+_USUAL_SIGMA = 0.05
+"""Standard deviation of what trajectories take from the depth of an instance, which the scene around it has corrected,
+before they are seen."""
+_INDEPENDENT = 3
+"""Points of one instance are wrong together: they say no more than this many on their own."""
 _WHOLE = 0.99
 """Part of the pixels between which depth is carried that have to be the instance's."""
 _WINDOW_SIGMAS = 4.0
@@ -59,10 +65,12 @@ def correct_moving(
     if np.count_nonzero(good) < config.min_control_points:
         return log_depth
     usual = float(np.median(left[good]))
+    apart = robust_sigma(left[good] - usual)
+    share = _USUAL_SIGMA**2 / (_USUAL_SIGMA**2 + apart**2 / min(int(np.count_nonzero(good)), _INDEPENDENT))
     good &= np.abs(left - usual) < _WRONG
     at = row[good], column[good]
     field = smooth_field_of_points(at, left[good] - usual, _POINT_WEIGHT, (height, width), config)
-    return np.where(pixels, log_depth + (np.float32(usual) + field), log_depth)
+    return np.where(pixels, log_depth + np.float32(share) * (np.float32(usual) + field), log_depth)
 
 
 def _inside(pixels: BoolArray) -> Float32Array:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.stages import FusionConfig
-from uni4d_fg.results.fusion.cue_error import fit_affine
-from uni4d_fg.results.fusion.densify import ControlPoints
+from uni4d_fg.slam.stages.affine_error import fit_affine
 
 _LEAST = 7e-4
 """Error of the log depth from which one cue is compared with others."""
@@ -21,7 +23,7 @@ _DEEP = 0.2
 """... and above which the landmarks of a frame are not."""
 
 
-def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> list[int]:
+def contradicting_frames(seen: Sequence[tuple[FloatArray, FloatArray]], config: FusionConfig) -> list[int]:
     """Return the frames whose cue, but for scale and shift of its disparity, is far worse than that of the others.
 
     Every frame's cue is compared with the landmarks that it sees. A frame is named if what is left is both
@@ -31,18 +33,19 @@ def contradicting_frames(control: list[ControlPoints], config: FusionConfig) -> 
     other frames are not.
 
     Args:
-        control: Landmarks of all frames.
+        seen: Of each frame, the cue (N,), m, at the landmarks that it sees, and log z - log cue (N,) there; NaN where
+            either is unknown.
         config: Thresholds.
     """
-    left = np.full((len(_QUANTILES), len(control)), np.nan)
-    constant = np.full((len(_QUANTILES), len(control)), np.nan)
-    spread = np.full((2, len(control)), np.nan)
-    for frame, points in enumerate(control):
-        static = (points.instance == 0) & np.isfinite(points.log_scale) & (points.cue > 0)
-        if np.count_nonzero(static) < config.min_control_points:
+    left = np.full((len(_QUANTILES), len(seen)), np.nan)
+    constant = np.full((len(_QUANTILES), len(seen)), np.nan)
+    spread = np.full((2, len(seen)), np.nan)
+    for frame, (cue, log_scale) in enumerate(seen):
+        known = np.isfinite(log_scale) & (cue > 0)
+        if np.count_nonzero(known) < config.min_control_points:
             continue
-        cue = points.cue[static]
-        log_z = points.log_scale[static] + np.log(cue)
+        cue = cue[known]
+        log_z = log_scale[known] + np.log(cue)
         a, b, _ = fit_affine(cue, log_z, np.ones(len(log_z)))
         left[:, frame] = np.quantile(np.abs(log_z + np.log(a / cue + b)), _QUANTILES)
         constant[:, frame] = np.quantile(np.abs(log_z - np.median(log_z)), _QUANTILES)
