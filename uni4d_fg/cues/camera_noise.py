@@ -15,8 +15,8 @@ from uni4d_fg.factors.static_reprojection import static_reprojection_jacobian
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.robust import MEDIAN_OF_NORM
 
-_MOST_POINTS = 2000
-"""Points of a frame that are looked at; the variance for more is less in proportion."""
+_MOST_POINTS = 1000
+"""Points of a frame that are looked at: more would say no more, as those beside each other err alike."""
 _FEWEST_POINTS = 6
 _SOFT = 2.0
 """Errors, in standard deviations, from which on a point counts less than half."""
@@ -60,7 +60,7 @@ class CameraNoise:
             off = np.linalg.norm(residual, axis=1)
             sigma = max(float(np.median(off)) / MEDIAN_OF_NORM, 1e-6)
             weight = 1.0 / (1.0 + (off / (_SOFT * sigma)) ** 2)
-            information = np.einsum("n,nki,nkj->ij", weight, by_pose, by_pose) * (len(seen) / len(some))
+            information = np.einsum("n,nki,nkj->ij", weight, by_pose, by_pose)
             try:
                 in_camera = sigma**2 * np.linalg.inv(information)[3:, 3:]
             except np.linalg.LinAlgError:

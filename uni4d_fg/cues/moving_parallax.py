@@ -17,8 +17,8 @@ the part of the path's differences that are such errors,
 
     u' = u_s + (u - u_s) (1 - lambda)
 
-is found. ``lambda`` is known from how exactly cameras are known, but for a factor (1 to 7 of the variances of 30
-rendered clips): where it may be near one, nothing is.
+is found. ``lambda`` is known from how exactly cameras are known, but for a factor (errors of 17 rendered clips are 0.8
+to 2.1 times as large as told, and 3.6 times where motion blurs the picture): where it may be near one, nothing is.
 
 If the thing's depth changes, ``z(t) = z / s(t)`` by its apparent size ``s``, it holds for ``r(t) / s(t)``.
 
