@@ -110,26 +110,49 @@ def predict_log_scale(
     found = [part for part in map_in_order(of_frame, list(range(count)), thread_count()) if part is not None]
     if not found:
         return whole_frame
-    spread = robust_sigma(np.concatenate([part.left for part in found]))
-    left, predicted, away, meant = np.concatenate([part.pairs for part in found], axis=1)
-    usual = _OUTLIER * spread
-    sound = (np.abs(left) <= usual) & (np.abs(predicted) <= usual)
-    at, share, errors = [], [], []
-    for number in np.unique(meant).tolist():
-        here = meant == number
-        x, y = predicted[here & sound], left[here & sound]
-        share.append(float(np.clip(y @ x / max(float(x @ x), 1e-300), 0.0, 1.0)))
-        # Of the sample itself, as its spread is not quite that of all.
-        error = robust_sigma(left[here] - share[-1] * predicted[here]) / max(robust_sigma(left[here]), 1e-300)
-        errors.append(spread * min(error, 1.0))
-        at.append(float(np.median(away[here])))
+    measured = _ByDistance.of(found)
     log_scale, variance = frame_log_scale[queries.frame], np.zeros(len(queries))
     for one in found:
-        log_scale[one.query] = one.log_scale + np.interp(one.distance, at, share) * one.around
-        variance[one.query] = np.interp(one.distance, at, errors) ** 2
+        told = np.isfinite(one.log_scale)  # not where there is no cue
+        at = one.distance[told]
+        log_scale[one.query[told]] = one.log_scale[told] + np.interp(at, *measured.share) * one.around[told]
+        variance[one.query[told]] = np.interp(at, *measured.sigma) ** 2
     asked = variance[variance > 0]
-    sigma = float(np.sqrt(asked.mean())) if len(asked) else errors[0]
+    sigma = float(np.sqrt(asked.mean())) if len(asked) else measured.sigma.value[0]
     return LocalScale(log_scale, sigma, frame_sigma) if sigma < _BETTER * frame_sigma else whole_frame
+
+
+class _Curve(NamedTuple):
+    """Values at distances, px, ascending."""
+
+    distance: FloatArray
+    value: FloatArray
+
+
+class _ByDistance(NamedTuple):
+    """How well static observations are predicted by others, by how far those are."""
+
+    share: _Curve
+    """lambda"""
+    sigma: _Curve
+    """Standard deviation of what a prediction misses."""
+
+    @classmethod
+    def of(cls, found: list[_OfFrame]) -> _ByDistance:
+        spread = robust_sigma(np.concatenate([part.left for part in found]))
+        left, predicted, away, meant = np.concatenate([part.pairs for part in found], axis=1)
+        usual = _OUTLIER * spread
+        sound = (np.abs(left) <= usual) & (np.abs(predicted) <= usual)
+        rows = []
+        for number in np.unique(meant).tolist():
+            here = meant == number
+            x, y = predicted[here & sound], left[here & sound]
+            share = float(np.clip(y @ x / max(float(x @ x), 1e-300), 0.0, 1.0))
+            # Of the sample itself, as its spread is not quite that of all.
+            error = robust_sigma(left[here] - share * predicted[here]) / max(robust_sigma(left[here]), 1e-300)
+            rows.append((float(np.median(away[here])), share, spread * min(error, 1.0)))
+        distance, shares, errors = np.array(sorted(rows)).T
+        return cls(_Curve(distance, shares), _Curve(distance, errors))
 
 
 def _of_frame(
