@@ -251,6 +251,26 @@ def test_a_region_whose_tracks_are_static_is_not_believed() -> None:
     assert sorted(int(m.sum()) for m in kept) == [900, 1600]
 
 
+@pytest.mark.parametrize(("moving_tracks", "is_kept"), [(5, True), (1, False)])
+def test_of_a_region_that_joins_what_stands_the_part_that_moves_is_kept(moving_tracks: int, is_kept: bool) -> None:
+    """A child before a climbing frame: bars around which evidence errs are joined to it, and have more tracks."""
+    region = np.zeros((240, 320), bool)
+    region[60:180, 60:100] = True  # the child
+    region[100:106, 100:260] = True  # a bar
+    moves = np.array([[80, 70 + 25 * n] for n in range(moving_tracks)])
+    stands = np.array([[105 + 12 * n, 103] for n in range(12)])
+    uv = np.concatenate([moves, stands])[:, None].astype(np.float32)
+    tracks = Tracks(uv, np.ones((len(uv), 1), bool), np.zeros(len(uv), np.int32))
+    moving = np.arange(len(uv)) < moving_tracks
+    kept = trusted_components(region, tracks, TrackMotion(moving, ~moving, np.zeros(len(uv))), 0, MotionMaskConfig())
+    if not is_kept:
+        assert len(kept) == 0
+        return
+    (mask,) = kept
+    assert mask[60:180, 60:100].mean() > 0.97
+    assert mask[100:106, 110:240].mean() < 0.05
+
+
 def test_moving_things_are_masked(moving_scene: Simulation, moving_result: MotionMasks) -> None:
     labels = np.stack(list(moving_result.labels))
     assert labels.dtype == np.int32

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.guided_filter import guided_filter
 from uni4d_fg.cues.track_motion import TrackMotion
 from uni4d_fg.frontend.track_model import Tracks
+
+_STATIC_REACH = 0.012
+"""A static track denies pixels around it up to this part of the image's diagonal, where evidence says otherwise."""
+_FEWEST_MOVING = 2
+"""Tracks that have to move in what is left of a region that others deny."""
 
 
 def track_evidence(
@@ -93,15 +100,55 @@ def _fill_holes(region: BoolArray, below_px: int) -> BoolArray:
 def trusted_components(
     region: BoolArray, tracks: Tracks, motion: TrackMotion, frame: int, config: MotionMaskConfig
 ) -> BoolArray:
-    """Return the connected parts (N, H, W) of a region that are large enough and that their tracks do not deny."""
-    height, width = region.shape
-    count, part, statistics, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8))
-    votes = [_votes(part, count, tracks, which, frame) for which in (motion.moving, motion.static)]
-    large = statistics[:, cv2.CC_STAT_AREA] >= max(1, round(config.min_area_fraction * height * width))
-    denied = votes[1] > config.max_static_fraction * (votes[0] + votes[1])
-    kept = np.flatnonzero(large & ~denied)
-    kept = kept[kept > 0]
-    return np.asarray(part[None] == kept[:, None, None])
+    """Return the connected parts (N, H, W) of a region that are large enough and that their tracks do not deny.
+
+    Where most tracks of a part are static, something that stands has joined what moves: then the pixels count that are
+    nearer to a track that moves than to a static one, or far from those.
+    """
+    parts = _Parts.of(region, tracks, motion, frame, config)
+    denied = parts.denied
+    if not (denied & (parts.moving >= _FEWEST_MOVING)).any():
+        return parts.masks(~denied)
+    to_moving, to_static = (_distance(tracks, which, frame, region.shape) for which in (motion.moving, motion.static))
+    reach = np.float32(_STATIC_REACH * np.hypot(*region.shape))
+    kept = region & ((to_moving < to_static) | (to_static > reach))
+    split = _Parts.of(kept & denied[parts.number], tracks, motion, frame, config)
+    return np.concatenate([parts.masks(~denied), split.masks(~split.denied & (split.moving >= _FEWEST_MOVING))])
+
+
+class _Parts(NamedTuple):
+    """The connected parts of a region; the first is what is left of the image."""
+
+    number: Int32Array
+    """(H, W)."""
+    large: BoolArray
+    """(N,)."""
+    moving: FloatArray
+    """(N,) tracks that move, ..."""
+    denied: BoolArray
+    """... and whether too many are static."""
+
+    @classmethod
+    def of(cls, region: BoolArray, tracks: Tracks, motion: TrackMotion, frame: int, config: MotionMaskConfig) -> _Parts:
+        height, width = region.shape
+        count, number, statistics, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8))
+        moving, static = (_votes(number, count, tracks, which, frame) for which in (motion.moving, motion.static))
+        large = statistics[:, cv2.CC_STAT_AREA] >= max(1, round(config.min_area_fraction * height * width))
+        large[0] = False
+        denied = large & (static > config.max_static_fraction * (moving + static))
+        return cls(np.asarray(number, np.int32), np.asarray(large), moving, np.asarray(denied))
+
+    def masks(self, which: BoolArray) -> BoolArray:
+        """Return the large ones of some parts (N,), (n, H, W)."""
+        return np.asarray(self.number[None] == np.flatnonzero(self.large & which)[:, None, None])
+
+
+def _distance(tracks: Tracks, which: BoolArray, frame: int, shape: tuple[int, ...]) -> Float32Array:
+    """Return how far each pixel (H, W) is from the nearest of some tracks, px."""
+    away = np.ones(shape, np.uint8)
+    column, row = np.floor(tracks.uv[which & tracks.visible[:, frame], frame] + 0.5).astype(np.int64).T
+    away[np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)] = 0
+    return np.asarray(cv2.distanceTransform(away, cv2.DIST_L2, 3))
 
 
 def grown(masks: BoolArray, radius_px: int) -> BoolArray:
