@@ -14,6 +14,7 @@ from uni4d_fg.cues.structure import motion
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import structure_from_motion
 from uni4d_fg.cues.structure.passing_thing import explains_more, most_left_over, only_seems_to_turn
+from uni4d_fg.errors import SolverError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, unproject, world_to_camera
 from uni4d_fg.progress import SilentReporter
@@ -127,6 +128,21 @@ def test_what_a_thing_leaves_over_is_the_world_if_it_explains_more(monkeypatch: 
     right = evaluate_trajectory(found.world_T_cam, street.world_T_cam)
     assert right.ate_m < 0.01 * np.ptp(street.world_T_cam[:, 1, 3])
     assert evaluate_trajectory(found.world_T_cam, street.bus_T_cam).ate_m > 10 * right.ate_m
+
+
+def test_a_rest_that_cannot_be_solved_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    street = passing(0, sway=0.8)
+    grown = motion._Search._grown
+
+    def failing(search: motion._Search, used: Observations, intrinsics: np.ndarray, free: bool) -> object:
+        if len(used) < len(street.observations):
+            raise SolverError("singular")
+        return grown(search, used, intrinsics, free)
+
+    monkeypatch.setattr(motion._Search, "_grown", failing)
+    monkeypatch.setattr(motion, "most_left_over", lambda scene, used, size: used.select(used.frame < FRAMES - 1))
+    config = load_config("default", [f"geometric_depth.max_tracks={10**6}"])
+    assert structure_from_motion(street.observations, FRAMES, SIZE, GUESS, config, SilentReporter(), lambda: False)
 
 
 def test_without_another_scene_the_camera_only_turns(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -56,6 +57,9 @@ bent; 0.98 and more where both start alike."""
 _BLUNTER = 1.15
 """Times the sharpest errors of a scene with a pinhole that one with a lens has, at most: up to 1.03 where there is a
 lens, as ideal pixels are larger; 1.37 where people who sit in the picture asked for one."""
+
+
+SceneT = TypeVar("SceneT")
 
 
 @dataclass(frozen=True)
@@ -263,7 +267,7 @@ class _Search:
         rest = None if found is None else most_left_over(found.scene, used, self.image_size)
         if found is None or rest is None:
             return found
-        world = replace(self, start=None)._grown(rest, intrinsics, free_focal)
+        world = _if_solved(lambda: replace(self, start=None)._grown(rest, intrinsics, free_focal))
         if world is not None and explains_more(world.scene, found.scene, used, self.image_size):
             return replace(world, used=used)
         turns = only_seems_to_turn(rest, self.num_frames, intrinsics, settings, known_focal=not free_focal)
@@ -386,7 +390,7 @@ def _at_cameras(scene: GrowingScene, start: StartCameras) -> GrowingScene:
     )  # fmt: skip
 
 
-def _if_solved(grow_other: Callable[[], GrowingScene]) -> GrowingScene | None:
+def _if_solved(grow_other: Callable[[], SceneT | None]) -> SceneT | None:
     """Return another scene, or None where it cannot be solved: that is no reason to do without the other starts."""
     try:
         return grow_other()
