@@ -13,6 +13,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread
 from uni4d_fg.factors.static_reprojection import static_reprojection_jacobian
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.robust import MEDIAN_OF_NORM
 
 _MOST_POINTS = 1000
@@ -53,7 +54,7 @@ class CameraNoise:
             uv = tracks.uv[track[some], frame].astype(np.float64)
             at = np.broadcast_to(pose, (len(some), 4, 4)), points[some], np.broadcast_to(intrinsics, (len(some), 4))
             residual, (by_pose, *_) = static_reprojection_jacobian(*at, uv=uv)
-            depth = (points[some] - pose[:3, 3]) @ pose[:3, 2]
+            depth = world_to_camera(*at[:2])[:, 2]
             inverse.append(1.0 / depth[depth > 0])
             if len(some) < _FEWEST_POINTS:
                 continue

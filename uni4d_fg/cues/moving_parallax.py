@@ -22,10 +22,9 @@ to 2.1 times as large as told, and 3.6 times where motion blurs the picture): wh
 
 If the thing's depth changes, ``z(t) = z / s(t)`` by its apparent size ``s``, it holds for ``r(t) / s(t)``.
 
-Sources: regression with errors in the regressor, Fuller, "Measurement Error Models" (1987); with a smooth
-nuisance, Wahba, "Spline Models for Observational Data" (1990), chapter 9; when a
-trajectory can be reconstructed from one camera, Park et al., "3D reconstruction of a moving point from a series of 2D
-projections" (ECCV 2010).
+Sources: regression with errors in the regressor, Fuller, "Measurement Error Models" (1987); with a smooth nuisance,
+Wahba, "Spline Models for Observational Data" (1990), chapter 9; when a trajectory can be reconstructed from one camera,
+Park et al., "3D reconstruction of a moving point from a series of 2D projections" (ECCV 2010).
 """
 
 from __future__ import annotations

@@ -146,8 +146,7 @@ class _Parts(NamedTuple):
 def _distance(tracks: Tracks, which: BoolArray, frame: int, shape: tuple[int, ...]) -> Float32Array:
     """Return how far each pixel (H, W) is from the nearest of some tracks, px."""
     away = np.ones(shape, np.uint8)
-    column, row = np.floor(tracks.uv[which & tracks.visible[:, frame], frame] + 0.5).astype(np.int64).T
-    away[np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)] = 0
+    away[_image_pixels(tracks, which, frame, shape)] = 0
     return np.asarray(cv2.distanceTransform(away, cv2.DIST_L2, 3))
 
 
@@ -164,8 +163,10 @@ def disk(radius_px: int) -> npt.NDArray[np.uint8]:
 
 
 def _votes(part: np.ndarray, count: int, tracks: Tracks, which: BoolArray, frame: int) -> FloatArray:
-    seen = which & tracks.visible[:, frame]
-    column, row = np.floor(tracks.uv[seen, frame] + 0.5).astype(np.int64).T
-    height, width = part.shape
-    inside = part[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    inside = part[_image_pixels(tracks, which, frame, part.shape)]
     return np.bincount(inside, minlength=count).astype(np.float64)
+
+
+def _image_pixels(tracks: Tracks, which: BoolArray, frame: int, shape: tuple[int, ...]) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the tracks, of some (K,), that a frame (H, W) shows."""
+    return working_pixels(tracks.uv[which & tracks.visible[:, frame], frame], (shape[0], shape[1]), np.ones(2))

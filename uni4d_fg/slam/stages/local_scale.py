@@ -22,15 +22,15 @@ from uni4d_fg.arrays import FloatArray, IntArray, evenly_spread, rows_by_group
 from uni4d_fg.geometry.nearest_points import NearestPoints
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.robust import robust_sigma
-from uni4d_fg.slam.stages.affine_error import fit_affine
+from uni4d_fg.slam.stages.affine_error import SHIFT_SIGMA, fit_affine
 from uni4d_fg.slam.stages.observations import Observations
 
 _DIRECTIONS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 _AWAY = (0.0, 0.02, 0.04, 0.08, 0.16, 0.3)
 """How far static observations are predicted from, as parts of the diagonal that they span."""
-_SHIFT_SIGMA = 0.04
+_SHIFT_SIGMA = 0.5 * SHIFT_SIGMA
 """Standard deviation of the shift of a frame's disparity, of the median one. Things that move are mostly before what
-they are compared with, where a wrong shift costs most: this is half of what a whole frame's depth is fitted with."""
+they are compared with, where a wrong shift costs most: half of what a whole frame's depth is fitted with."""
 _FARTHEST = 0.1
 """Least part of the inverse depth that a shift leaves."""
 _BETTER = 0.97
