@@ -18,7 +18,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.results.fusion.wide_window import averaged, nodes, resized, sigma_on
-from uni4d_fg.slam.stages.affine_error import SHIFT_SIGMA, fit_affine
+from uni4d_fg.slam.stages.affine_error import SHIFT_SIGMA, AffineError, fit_affine
 
 _MAX_SAMPLES = 4000
 _MIN_SAMPLES = 12
@@ -42,12 +42,8 @@ class CorrectedCue:
 
     log_depth: Float32Array
     """(h, w), NaN where the cue is missing."""
-    spread: float
-    """Spread of the affinely corrected cue's error over the frame (robust standard deviation of log depth)."""
-    scale: float
-    """a"""
-    shift: float
-    """b, 1/m."""
+    error: AffineError
+    """(a, b)"""
     least_inverse: float
     """1/m: what is farther is bounded."""
     field: Float32Array
@@ -55,7 +51,7 @@ class CorrectedCue:
 
     def affine(self, cue: Float32Array) -> Float32Array:
         """Return the log depth of a cue, m, without its affine error alone; of any pixels of the same frame."""
-        return _affine_log_depth(cue, self.scale, self.shift, self.least_inverse)
+        return self.error.log_depth(cue, self.least_inverse)
 
 
 def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, config: FusionConfig) -> CorrectedCue:
@@ -70,37 +66,32 @@ def correct_cue(cue: Float32Array, known: KnownDepth, default_log_scale: float, 
     usable = np.isfinite(cue) & (known.weight > 0) & np.isfinite(known.log_depth)
     rows, columns = np.nonzero(usable)
     if len(rows) < _MIN_SAMPLES:
-        nothing, scale = np.zeros_like(cue), float(np.exp(-default_log_scale))
+        error = AffineError(float(np.exp(-default_log_scale)), 0.0, np.nan)
         log_depth = np.log(cue) + np.float32(default_log_scale)
-        return CorrectedCue(log_depth, np.nan, scale, 0.0, _least_inverse(cue, scale, 0.0), nothing)
+        return CorrectedCue(log_depth, error, _least_inverse(cue, error), np.zeros_like(cue))
     some = evenly_spread(len(rows), _MAX_SAMPLES)
     at = rows[some], columns[some]
-    a, b, spread = fit_affine(
+    error = fit_affine(
         cue[at].astype(np.float64),
         known.log_depth[at].astype(np.float64),
         known.weight[at].astype(np.float64),
         SHIFT_SIGMA,
     )
-    least = _least_inverse(cue, a, b)
-    log_depth = _affine_log_depth(cue, a, b, least)
+    least = _least_inverse(cue, error)
+    log_depth = error.log_depth(cue, least)
     residual = np.where(usable, known.log_depth - log_depth, np.float32(0))
-    weight = np.where(usable & (np.abs(residual) < 4.0 * spread + 0.02), known.weight, np.float32(0))
+    weight = np.where(usable & (np.abs(residual) < 4.0 * error.spread + 0.02), known.weight, np.float32(0))
     field = smooth_field(residual, weight, config)
-    return CorrectedCue(log_depth + field, spread, a, b, least, field)
+    return CorrectedCue(log_depth + field, error, least, field)
 
 
-def _affine_log_depth(cue: Float32Array, scale: float, shift: float, least_inverse: float) -> Float32Array:
-    inverse = np.maximum(np.float32(scale) / cue + np.float32(shift), np.float32(least_inverse))
-    return np.asarray(-np.log(inverse), dtype=np.float32)
-
-
-def _least_inverse(cue: Float32Array, scale: float, shift: float) -> float:
+def _least_inverse(cue: Float32Array, error: AffineError) -> float:
     """Return the inverse depth below which an affinely corrected cue is taken to be beyond all bounds, 1/m."""
     known = np.flatnonzero(np.isfinite(cue))
     if not known.size:
         return 0.0
     some = cue.ravel()[known[evenly_spread(known.size, _MAX_SAMPLES)]]
-    return _FARTHEST * float(np.median(np.float32(scale) / some + np.float32(shift)))
+    return _FARTHEST * float(np.median(error.scale / some + error.shift))
 
 
 def smooth_field(residual: Float32Array, weight: Float32Array, config: FusionConfig) -> Float32Array:

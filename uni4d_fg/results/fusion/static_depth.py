@@ -181,7 +181,7 @@ def fuse_static(
     corrected = correct_cue(cue, known.depth, default_log_scale, config)
     if measured is None or known.reliability == 0.0:
         # The cue errs less where landmarks have corrected it, but frames are compared everywhere.
-        usual = corrected.spread if np.isfinite(corrected.spread) else _UNCOMPARED_SIGMA
+        usual = corrected.error.spread if np.isfinite(corrected.error.spread) else _UNCOMPARED_SIGMA
         error = _MEAN_TO_SIGMA * cue_error if np.isfinite(cue_error) else usual
         sure = np.where(np.isfinite(corrected.log_depth), _within(np.float32(error)), np.float32(0))
         nothing = np.zeros_like(corrected.log_depth)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.robust import MAD_TO_SIGMA
+
+_Depth = TypeVar("_Depth", FloatArray, Float32Array)
 
 SHIFT_SIGMA = 0.08
 """Standard deviation of the shift, of the median inverse depth, before anything is seen."""
@@ -18,20 +21,36 @@ _INDEPENDENT = 30
 """The smooth error makes samples alike: all of a frame say no more than this many on their own."""
 
 
-def fit_affine(
-    cue: FloatArray, log_depth: FloatArray, weight: FloatArray, shift_sigma: float = np.inf
-) -> tuple[float, float, float]:
+class AffineError(NamedTuple):
+    """What makes depth of a cue ``D``: ``1 / z = scale / D + shift``."""
+
+    scale: float
+    shift: float
+    """1/m."""
+    spread: float
+    """Robust standard deviation of the log depth that is left; NaN where nothing was fitted."""
+
+    def log_depth(self, cue: _Depth, least_inverse: float | _Depth) -> _Depth:
+        """Return the log depth of a cue, m.
+
+        Args:
+            cue: (...) m.
+            least_inverse: Inverse depth, 1/m, that is left at least.
+        """
+        log_inverse: _Depth = np.log(np.maximum(self.scale / cue + self.shift, least_inverse))
+        return -log_inverse
+
+
+def fit_affine(cue: FloatArray, log_depth: FloatArray, weight: FloatArray, shift_sigma: float = np.inf) -> AffineError:
     """Fit ``1 / z = a / cue + b`` robustly.
+
+    A line that falls, or that makes depth of the samples negative, is replaced by a scale alone.
 
     Args:
         cue: (N,) m, positive.
         log_depth: (N,) of the same pixels.
         weight: (N,) not negative.
         shift_sigma: Standard deviation of the shift before anything is seen, of the median inverse depth.
-
-    Returns:
-        a, b, and the robust standard deviation of the log depth that is left. A line that falls, or that makes depth
-        negative, is replaced by a scale alone.
     """
     inverse, wanted = 1.0 / cue, np.exp(-log_depth)
     median = partial(_weighted_median, weight=None if weight.min() == weight.max() > 0 else weight)
@@ -40,7 +59,7 @@ def fit_affine(
     a, b = scale, 0.0
     # Relative residuals: an error of inverse depth counts by how deep it is.
     relative, mass = weight / wanted**2, float(weight.sum())
-    left = _log_left(a, b, inverse, log_depth)
+    left = -np.log(a * inverse) - log_depth
     for _ in range(_ITERATIONS):
         sigma = max(MAD_TO_SIGMA * median(np.abs(left)), 1e-4)
         w = relative / (1.0 + (left / (2.0 * sigma)) ** 2) ** 2
@@ -57,15 +76,10 @@ def fit_affine(
             slope, shift = scale, 0.0
         done = abs(slope - a) + abs(shift - b) < _SETTLED * (abs(a) + abs(b))
         a, b = slope, shift
-        left = _log_left(a, b, inverse, log_depth)
+        left = -np.log(a * inverse + b) - log_depth
         if done:
             break
-    return a, b, MAD_TO_SIGMA * median(np.abs(left))
-
-
-def _log_left(a: float, b: float, inverse: FloatArray, log_depth: FloatArray) -> FloatArray:
-    left: FloatArray = -np.log(np.maximum(a * inverse + b, 1e-9)) - log_depth
-    return left
+    return AffineError(a, b, MAD_TO_SIGMA * median(np.abs(left)))
 
 
 def _weighted_median(values: FloatArray, weight: FloatArray | None) -> float:

@@ -46,8 +46,8 @@ def contradicting_frames(seen: Sequence[tuple[FloatArray, FloatArray]], config: 
             continue
         cue = cue[known]
         log_z = log_scale[known] + np.log(cue)
-        a, b, _ = fit_affine(cue, log_z, np.ones(len(log_z)))
-        left[:, frame] = np.quantile(np.abs(log_z + np.log(a / cue + b)), _QUANTILES)
+        fitted = fit_affine(cue, log_z, np.ones(len(log_z)))
+        left[:, frame] = np.quantile(np.abs(log_z - fitted.log_depth(cue, 0.0)), _QUANTILES)
         constant[:, frame] = np.quantile(np.abs(log_z - np.median(log_z)), _QUANTILES)
         low, high = np.quantile([np.log(cue), log_z], _SPREAD, axis=1)
         spread[:, frame] = high - low

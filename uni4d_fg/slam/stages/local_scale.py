@@ -160,10 +160,10 @@ def _of_frame(
 ) -> _OfFrame:
     """Compare the queries of a frame, and static observations, with the static ones nearest to them, or farther off."""
     cue = static.depth.astype(np.float64)
-    a, b, _ = fit_affine(cue, log_scale + np.log(cue), np.ones(len(cue)), _SHIFT_SIGMA)
+    fitted = fit_affine(cue, log_scale + np.log(cue), np.ones(len(cue)), _SHIFT_SIGMA)
 
     def by_frame(depth: FloatArray) -> FloatArray:
-        return -np.log(np.maximum(a + b * depth, _FARTHEST * a))
+        return fitted.log_depth(depth, _FARTHEST * fitted.scale / depth) - np.log(depth)
 
     values, uv = log_scale - by_frame(cue), static.uv
     tree = NearestPoints(uv)
