@@ -20,8 +20,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.cues.depth_settings import OPEN_FOCAL_SIGMA
-from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.growth import CONVERGED
+from uni4d_fg.cues.structure.growing import GrowingScene, until_converged
 from uni4d_fg.cues.structure.selection import picture_cells
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.factors.state import State
@@ -151,7 +150,7 @@ class _Profile:
 
     def __init__(self, scene: GrowingScene, noise: float) -> None:
         stage, self.state, _, _ = scene.bundle(free_focal=False)
-        self.stage = replace(stage, solver=stage.solver.model_copy(update={"relative_decrease": CONVERGED}))
+        self.stage = until_converged(stage)
         self.allowed = 0.5 * _CHI2 * noise
         self.hooks = Hooks(should_stop=scene.should_stop)
         self.least, self.state = self._solve(self.state, 0.0)

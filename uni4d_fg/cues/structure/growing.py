@@ -36,6 +36,12 @@ from uni4d_fg.slam.stages.scene import StaticNoise
 
 _FOCAL_STEP = 0.15
 """Step of log f that cameras and points can follow."""
+_CONVERGED = 1e-7
+"""Relative decrease of the energy at which a refinement ends that tells a focal length: far in a valley, a step that
+lowers the energy by 1e-5 may still move it by several percent."""
+_PATIENCE = 10
+"""So many times more steps such a refinement may take: through a long lens that pans and moves, more than twice as many
+as others may."""
 
 
 @dataclass
@@ -186,6 +192,11 @@ class GrowingScene:
         if relative_decrease is not None:
             stage = replace(stage, solver=stage.solver.model_copy(update={"relative_decrease": relative_decrease}))
         self._take(self._solve(stage, state), frames, rows)
+
+    def converge(self) -> None:
+        """Refine as :meth:`adjust` does, until the focal lengths stay where they are. Raises as it does."""
+        stage, state, frames, rows = self.bundle()
+        self._take(self._solve(until_converged(stage), state), frames, rows)
 
     def _solve(self, stage: Stage, state: State) -> State:
         state, summary = run_stage(stage, state, Hooks(should_stop=self.should_stop))
@@ -342,6 +353,12 @@ class GrowingScene:
         factor = self.config.geometric_depth.median_depth / max(float(np.median(z)), 1e-9)
         self.position *= factor
         self.world_T_cam[:, :3, 3] *= factor
+
+
+def until_converged(stage: Stage) -> Stage:
+    """Return a stage that ends only where the focal length stays where it is."""
+    longer = {"relative_decrease": _CONVERGED, "max_iterations": _PATIENCE * stage.solver.max_iterations}
+    return replace(stage, solver=stage.solver.model_copy(update=longer))
 
 
 def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:

@@ -13,11 +13,6 @@ _BAD_SHARE = 0.5
 """A frame fits badly if it agrees with less than this part of what frames usually agree with."""
 
 
-CONVERGED = 1e-7
-"""Relative decrease of the energy at which a refinement ends that tells a focal length: far in a valley, a step that
-lowers the energy by 1e-5 may still move it by several percent."""
-
-
 def grow(scene: GrowingScene, reporter: Reporter, growth: float | None = None) -> None:
     """Add frames until no further one can be posed, refine, and try again with those that fit badly.
 

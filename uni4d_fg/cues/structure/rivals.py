@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uni4d_fg.arrays import FloatArray, IntArray
-from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.hypotheses import Hypothesis
 from uni4d_fg.errors import SolverError
 
@@ -52,7 +51,7 @@ def rivals_of(hypotheses: list[Hypothesis], world_T_cam: FloatArray) -> list[Riv
             continue
         try:
             hypothesis.scene.measure_noise()
-            hypothesis.scene.adjust(CONVERGED)
+            hypothesis.scene.converge()
         except SolverError:
             continue
         degrees, turns = rotation_difference(hypothesis.scene.world_T_cam, world_T_cam, frames)

@@ -15,7 +15,6 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.structure.growing import GrowingScene
-from uni4d_fg.cues.structure.growth import CONVERGED
 from uni4d_fg.cues.structure.triangulation import median_per_row
 from uni4d_fg.robust import MEDIAN_OF_NORM
 
@@ -68,7 +67,7 @@ def trim_and_converge(scene: GrowingScene) -> None:
     """
     trim(scene)
     scene.measure_noise()
-    scene.adjust(CONVERGED)
+    scene.converge()
 
 
 def _noise(scene: GrowingScene, error: FloatArray) -> FloatArray:
