@@ -175,6 +175,16 @@ def test_a_dissolve_that_larger_images_do_not_show_must_be_explained(
     assert cuts(frames) == (there if is_one else ())
 
 
+@pytest.mark.parametrize("is_pan", [True, False])
+def test_the_ends_of_a_dissolve_do_not_show_one_place(monkeypatch: pytest.MonkeyPatch, is_pan: bool) -> None:
+    """In the blur of a fast pan corners are lost, and what lies between its ends looks like a blend of both."""
+    frames = shot(0, 40, 4.0) if is_pan else dissolved(shot(0, 24), shot(1, 24), 8)
+    monkeypatch.setattr(_Search, "run", lambda search: (Cut(16, 24),) if len(search.frames) == 40 else ())
+    monkeypatch.setattr(_Search, "is_outlived", lambda *_: False)
+    larger = frames.repeat(2, axis=1).repeat(2, axis=2)
+    assert cuts(larger) == (() if is_pan else (Cut(16, 24),))
+
+
 def test_a_search_can_be_stopped() -> None:
     with pytest.raises(Cancelled):
         find_cuts(ArrayFrames(shot(0, 10)), CONFIG, lambda: True)

@@ -26,6 +26,7 @@ from uni4d_fg.config.shots import ShotsConfig
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.shots.links import SmallFrame, link, pan_between, small_frame
+from uni4d_fg.frontend.shots.one_place import show_one_place
 from uni4d_fg.frontend.shots.survival import Span, spans
 from uni4d_fg.optim.threads import map_in_order, thread_count
 
@@ -97,15 +98,18 @@ def _is_confirmed(
     """Tell whether a cut is found in larger images of the frames around it as well.
 
     A dissolve of which a blend explains much need not be found there if no corner outlives it: corners do not outlive a
-    fast orbit either.
+    fast orbit either. And its ends must not show one place, as those of a fast pan do, in whose blur corners are lost.
     """
-    reach = max(config.dissolve_spans) if cut.start > cut.stop else 2 * config.look_around
+    is_soft = cut.start > cut.stop
+    if is_soft and show_one_place(images[cut.stop - 1], images[cut.start], config.confirming_width):
+        return False
+    reach = max(config.dissolve_spans) if is_soft else 2 * config.look_around
     around = range(max(0, cut.stop - reach), min(len(images), cut.start + reach))
     larger = config.model_copy(update={"width": config.confirming_width})
     search = _Search(_small_frames(images, around, larger, should_stop), larger)
     there = Cut(cut.stop - around.start, cut.start - around.start)
     found = any(c.stop <= there.start and there.stop <= c.start for c in search.run())
-    return found or (cut.start > cut.stop and explained >= _MUCH_EXPLAINED and not search.is_outlived(there))
+    return found or (is_soft and explained >= _MUCH_EXPLAINED and not search.is_outlived(there))
 
 
 @dataclass(frozen=True)

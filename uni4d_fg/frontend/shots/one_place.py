@@ -1,0 +1,59 @@
+"""Do two frames show one place? By SIFT features that a similarity takes from one to the other.
+
+Corners that are followed are lost in the blur of a fast pan, and what lies between its ends looks like a blend of both.
+Features need not be followed. Of two frames of different shots a dozen never agree: of 270 pairs of rendered clips and
+recordings 6 did at most; across a blurred pan of 15 frames a second, before plain walls, 21 to 35.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from uni4d_fg.arrays import ImageArray
+
+_FEATURES = 400
+_DISTINCT = 0.8
+"""A feature is matched whose best match is nearer than this part of the distance of the second."""
+_ERROR_PX = 3.0
+_SCALES = (0.5, 2.0)
+_LEAST = 12
+"""Features that must agree."""
+
+
+def show_one_place(one: ImageArray, other: ImageArray, longer_side: int) -> bool:
+    """Tell whether two frames (H, W, 3) or (H, W), uint8, show one place, from about the same side.
+
+    Args:
+        one: The one.
+        other: The other.
+        longer_side: Of the images that are compared, px.
+    """
+    (here, described), (there, described_other) = (_features(image, longer_side) for image in (one, other))
+    if min(len(here), len(there)) < _LEAST:
+        return False
+    pairs = [
+        found[0]
+        for found in cv2.BFMatcher().knnMatch(described, described_other, k=2)
+        if found[0].distance < _DISTINCT * found[1].distance
+    ]
+    if len(pairs) < _LEAST:
+        return False
+    source = here[[pair.queryIdx for pair in pairs]]
+    target = there[[pair.trainIdx for pair in pairs]]
+    moved, agrees = cv2.estimateAffinePartial2D(source, target, method=cv2.RANSAC, ransacReprojThreshold=_ERROR_PX)
+    if moved is None or not _SCALES[0] < np.hypot(moved[0, 0], moved[0, 1]) < _SCALES[1]:
+        return False
+    return int(np.count_nonzero(agrees)) >= _LEAST
+
+
+def _features(image: ImageArray, longer_side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return where features (N, 2) are, and what they look like (N, 128)."""
+    gray = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, longer_side / max(gray.shape))
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    detector = cv2.SIFT_create(nfeatures=_FEATURES)  # type: ignore[attr-defined]
+    points, described = detector.detectAndCompute(small, None)
+    if described is None:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    return np.array([point.pt for point in points]), described
