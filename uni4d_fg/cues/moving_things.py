@@ -38,6 +38,7 @@ _MODEL_WRONG = 0.1
 _ON_IT = 0.5
 """A track is on a thing if it is inside its mask in this part of its frames."""
 _MIN_TRACKS = 8
+_MOSTLY = 0.5
 _CUT_WIDTH = 0.4
 """A thing is cut off where its mask is wider than this at the image's lower border, as a part of its widest row: what
 reaches down to it and is narrower is a foot or a shadow."""
@@ -45,13 +46,13 @@ reaches down to it and is narrower is a foot or a shadow."""
 
 @dataclass
 class Sightings:
-    """Collects, frame by frame, which tracks are on which thing and where things are cut off."""
+    """Collects, frame by frame, which tracks are on which thing and how much of it is cut off."""
 
     tracks: Tracks
     inside: dict[int, IntArray] = field(default_factory=dict)
     """By id: (K,) frames in which a track is inside the mask."""
-    cut: dict[int, list[bool]] = field(default_factory=dict)
-    """By id: whether the image's lower border cuts it off, in each frame that has it."""
+    area: dict[int, IntArray] = field(default_factory=dict)
+    """By id: (2,) its area, px, of all frames together, and of those in which the image's lower border cuts it off."""
 
     def add(self, frame: int, mask: Int32Array) -> None:
         """Add the mask (H, W) of a frame."""
@@ -64,7 +65,16 @@ class Sightings:
             inside = self.inside.setdefault(label, np.zeros(self.tracks.num_tracks, np.int64))
             inside[seen[at == label]] += 1
             width = np.count_nonzero(mask == label, axis=1)
-            self.cut.setdefault(label, []).append(bool(width[-1] > _CUT_WIDTH * width.max()))
+            is_cut = width[-1] > _CUT_WIDTH * width.max()
+            self.area.setdefault(label, np.zeros(2, np.int64))[:] += int(width.sum()) * np.array([1, is_cut])
+
+    def is_cut(self, label: int) -> bool:
+        """Tell whether the image cuts a thing off in most of what it shows of it.
+
+        Frames count by area: what is left of a mask while a thing comes and goes says nothing of where it stands.
+        """
+        whole, cut = self.area[label].tolist()
+        return bool(cut > _MOSTLY * whole)
 
     def on(self, label: int) -> BoolArray:
         """Return which tracks (K,) are on a thing."""
@@ -107,7 +117,7 @@ def place_moving(
     unknown = []
     for label in sorted(sightings.inside):
         mine = sightings.on(label)
-        cut = float(np.mean(sightings.cut[label])) > _ON_IT
+        cut = sightings.is_cut(label)
         stretches = list[Parallax]()
         if np.count_nonzero(mine) >= _MIN_TRACKS:
             uv = tracks.uv[mine].astype(np.float64)
