@@ -14,7 +14,7 @@ if len(sys.argv) > 1:
 else:
     source = fg.make_synthetic_sequence(SyntheticSceneConfig(num_frames=12, width=200, height=150, focal=188.0))
     run = Path(tempfile.mkdtemp())
-result = fg.reconstruct(source, run, "fast")
+result = fg.reconstruct(source, run, "fast", overwrite=True)
 print(
     f"{len(result.world_T_cam)} cameras, {len(result.landmarks)} landmarks, {len(result.dynamic_points)} trajectories"
 )

@@ -18,7 +18,7 @@ from uni4d_fg.cli.options import LayoutChoice
 from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import CUE_FOLDER, SequenceInput, prepare_run_folder
 from uni4d_fg.errors import Cancelled, ConfigError
-from uni4d_fg.results.run_contents import mark_run, run_lock
+from uni4d_fg.results.run_contents import COMMAND_LINE, mark_run, run_lock
 
 if TYPE_CHECKING:
     from uni4d_fg.config.models import Config
@@ -87,6 +87,7 @@ def reconstruct(
     from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
     from uni4d_fg.pipeline.usable_cues import check_given_cues
     from uni4d_fg.pipeline.workers.options import WorkerOptions
+    from uni4d_fg.results.shot_list import check_same_split
 
     began = time.perf_counter()
     chosen = [] if solver is None else [f"solver={solver.value}"]
@@ -141,7 +142,7 @@ def reconstruct(
         looked_for = settings.shots.split == "auto" and not is_measured
         cuts = shots.cuts_of(opened.video, settings.shots) if looked_for else ()
         split = bool(cuts) and not one_shot
-        shots.check_same_split(run, split, resume=resume)
+        check_same_split(run, split, resume=resume, remedies=COMMAND_LINE)
         if split:
             found = shots.shots_between(cuts, source, opened.video.num_frames, settings.shots.min_frames)
             done, summaries, failure = shots.reconstruct_shots(

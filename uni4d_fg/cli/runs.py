@@ -20,15 +20,7 @@ from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.sequence.read import detect_layout, read_sequence
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
 from uni4d_fg.reading import expanded, is_present, read_text, resolved
-from uni4d_fg.results.run_contents import (
-    STORED_INPUT,
-    is_barely_begun,
-    is_free,
-    is_run,
-    mark_run,
-    remove_leftovers,
-    remove_results,
-)
+from uni4d_fg.results.run_contents import COMMAND_LINE, STORED_INPUT, claim_folder
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.results.summary_file import read_summary
 
@@ -258,25 +250,8 @@ def prepare_run_folder(
         OutputError: If the folder holds anything but a run, or a run that is neither to be continued nor
             replaced, or one of another video.
     """
-    if resume and overwrite:
-        raise OutputError("--resume and --overwrite exclude each other; give one of them")
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; choose another --out")
-    try:
-        free = is_free(folder) or is_barely_begun(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be read ({error.strerror}); choose another --out") from error
-    if free:
-        remove_leftovers(folder)
-    elif not is_run(folder):
-        raise OutputError(f"{folder}: is not empty and holds no run; choose another --out")
-    elif overwrite:
-        remove_results(folder)
-    elif not resume:
-        raise OutputError(f"{folder}: holds a run already; continue it with --resume or replace it with --overwrite")
-    else:
+    if claim_folder(folder, resume=resume, overwrite=overwrite, remedies=COMMAND_LINE):
         _check_same_video(folder, source, whole)
-    mark_run(folder)
     source.save(folder)
 
 

@@ -13,12 +13,12 @@ from uni4d_fg.cli.console import one_line, print_error, print_json
 from uni4d_fg.cli.interruption import Interruption, resume_command
 from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder, shot_of
 from uni4d_fg.config.shots import ShotsConfig
-from uni4d_fg.errors import Cancelled, InputError, OutputError, Uni4dFgError
+from uni4d_fg.errors import Cancelled, InputError, Uni4dFgError
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
 from uni4d_fg.frontend.shots.cuts import Cut, find_cuts
 from uni4d_fg.results.run_contents import run_lock
-from uni4d_fg.results.shot_list import Shot, is_split, shot_folder, write_shots
+from uni4d_fg.results.shot_list import Shot, shot_folder, write_shots
 
 if TYPE_CHECKING:
     from uni4d_fg.frontend.sequence.model import Sequence, Video
@@ -71,16 +71,6 @@ def one_shot_warning(cuts: tuple[Cut, ...], source: SequenceInput) -> str:
     return (
         f"there are cuts at frame {frames}: it was solved as one shot nevertheless, and what lies behind one is wrong"
     )
-
-
-def check_same_split(run: Path, split: bool, *, resume: bool) -> None:
-    """Raise OutputError if a run is to be continued in another form than it was begun."""
-    if resume and is_split(run) != split and (is_split(run) or (run / "stages").is_dir()):
-        was, now = ("several shots", "one") if is_split(run) else ("one shot", "several")
-        raise OutputError(
-            f"{run}: holds a run in {was}, and this one is in {now}; continue it with the same options, or replace it "
-            "with --overwrite"
-        )
 
 
 def reconstruct_shots(

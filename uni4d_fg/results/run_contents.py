@@ -11,6 +11,7 @@ import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from uni4d_fg.errors import InputError, OutputError
@@ -53,6 +54,19 @@ _KNOWN = {
 """Folder of a run to the names of the files that are written into it."""
 
 
+@dataclass(frozen=True)
+class Remedies:
+    """What a caller is told to give where the folder of a run is in the way."""
+
+    resume: str
+    overwrite: str
+    elsewhere: str
+
+
+COMMAND_LINE = Remedies("--resume", "--overwrite", "choose another --out")
+PYTHON = Remedies("resume=True", "overwrite=True", "choose another folder")
+
+
 def is_temporary(path: Path, folder: str = "") -> bool:
     """Tell whether a name is that of a file which was being written into a folder of a run when its process died."""
     found = _TEMPORARY.fullmatch(path.name)
@@ -84,6 +98,43 @@ def is_free(root: Path) -> bool:
 def is_barely_begun(root: Path) -> bool:
     """Tell whether a run ended before it made anything: it is marked, and says at most what it was to be made from."""
     return is_run(root) and all(path.name in (MARKER, STORED_INPUT) or is_temporary(path) for path in root.iterdir())
+
+
+def claim_folder(root: Path, *, resume: bool, overwrite: bool, remedies: Remedies) -> bool:
+    """Make sure that a run may be written to a folder, and mark it.
+
+    Args:
+        root: Of the run.
+        resume: Continue an earlier run.
+        overwrite: Remove an earlier run's results.
+        remedies: How the caller spells these.
+
+    Returns:
+        Whether the folder holds an earlier run, which is to be continued.
+
+    Raises:
+        OutputError: If the folder holds anything but a run, or a run that is neither to be continued nor replaced.
+    """
+    if resume and overwrite:
+        raise OutputError(f"{remedies.resume} and {remedies.overwrite} exclude each other; give one of them")
+    if root.exists() and not root.is_dir():
+        raise OutputError(f"{root}: is a file; {remedies.elsewhere}")
+    try:
+        free = is_free(root) or is_barely_begun(root)
+    except OSError as error:
+        raise OutputError(f"{root}: cannot be read ({error.strerror}); {remedies.elsewhere}") from error
+    if free:
+        remove_leftovers(root)
+    elif not is_run(root):
+        raise OutputError(f"{root}: is not empty and holds no run; {remedies.elsewhere}")
+    elif overwrite:
+        remove_results(root)
+    elif not resume:
+        raise OutputError(
+            f"{root}: holds a run already; continue it with {remedies.resume} or replace it with {remedies.overwrite}"
+        )
+    mark_run(root)
+    return resume and not free
 
 
 def remove_leftovers(root: Path) -> None:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from uni4d_fg.errors import InputError
+from uni4d_fg.errors import InputError, OutputError
 from uni4d_fg.files import atomic_write_json
 from uni4d_fg.reading import is_present, read_json
+from uni4d_fg.results.run_contents import Remedies
 
 SHOT_LIST = "shots.json"
 SHOT_FOLDER = "shots"
@@ -46,6 +47,16 @@ class Shot:
 def is_split(run: Path) -> bool:
     """Tell whether a folder is that of a run in several shots."""
     return is_present(run / SHOT_LIST)
+
+
+def check_same_split(run: Path, split: bool, *, resume: bool, remedies: Remedies) -> None:
+    """Raise OutputError if a run is to be continued in another form than it was begun."""
+    if resume and is_split(run) != split and (is_split(run) or (run / "stages").is_dir()):
+        was, now = ("several shots", "one") if is_split(run) else ("one shot", "several")
+        raise OutputError(
+            f"{run}: holds a run in {was}, and this one is in {now}; continue it with the same options, or replace it "
+            f"with {remedies.overwrite}"
+        )
 
 
 def write_shots(run: Path, shots: list[Shot]) -> None:
