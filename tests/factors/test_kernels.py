@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 
+from uni4d_fg.errors import SolverError
 from uni4d_fg.factors.kernels import Kernel
 
 KERNELS = [
@@ -100,3 +103,21 @@ def test_square_root_form_is_finite_at_zero(kernel: Kernel) -> None:
     # Bounded by the curvature at zero: no amplified rounding just above the switch to zero.
     limit = 2.0 / min(kernel.threshold, 1.0) ** 2.5 if kernel.kind != "quadratic" else 1e-12
     assert (np.abs(slope) <= limit).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "threshold", "said"),
+    [
+        ("hubber", 1.0, "there is no kernel 'hubber'; choose one of quadratic, huber, pseudo_huber, cauchy, norm"),
+        (None, 1.0, "there is no kernel None"),
+        *(("huber", wrong, "finite and positive, got") for wrong in (-1, 0.0, np.nan, np.inf, "1", None)),
+    ],
+)
+def test_a_kernel_that_cannot_be_is_refused_where_it_is_made(kind: Any, threshold: Any, said: str) -> None:
+    with pytest.raises(SolverError, match=said):
+        Kernel(kind, threshold)
+
+
+def test_thresholds_may_be_any_real_number() -> None:
+    for threshold in (1, 0.5, np.float32(0.5), np.int64(2)):
+        assert Kernel("huber", threshold).threshold == threshold

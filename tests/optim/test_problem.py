@@ -16,6 +16,7 @@ from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS, LANDMARK, LOG_SCALE, POSE
 from uni4d_fg.geometry import se3
 from uni4d_fg.optim.problem import Problem, all_free
+from uni4d_fg.optim.solve import marginals, solve
 
 
 @pytest.fixture
@@ -99,3 +100,15 @@ def test_terms_of_one_name_add_up_and_exact_leaves_out_the_smoothing(rng: np.ran
     assert exact == pytest.approx(np.sum(np.sqrt(squared)) + 0.5 * np.sum(squared), rel=1e-12)
     others = problem.energy(state) - smooth
     assert problem.energy(state, exact=True) - exact == pytest.approx(others, rel=1e-9)
+
+
+def test_rows_that_the_state_does_not_have_are_named(state: State) -> None:
+    far = log_scale_prior(np.arange(6), measured=np.zeros((6, 1)), sigma=0.1)
+    said = r"log_scale_prior reads row 5 of log_scale \(depth log-scale, frame 5\), which the problem does not have"
+    problem = Problem.over(state).add(far)
+    with pytest.raises(SolverError, match=said):
+        solve(problem, state)
+    with pytest.raises(SolverError, match=said):
+        marginals(problem, state, LOG_SCALE)
+    with pytest.raises(SolverError, match=said):
+        Problem.over(state).add(far, state=state)

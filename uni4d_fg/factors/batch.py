@@ -31,7 +31,8 @@ class FactorBatch:
     """N factors of one type. The energy is ``sum_n weight_n rho(|r_n / sigma_n|)``.
 
     Raises:
-        SolverError: On construction, if an array's length differs from N, naming the term and the array.
+        SolverError: On construction, if an array's length differs from N, naming the term and the array, or the kernel
+            is no :class:`Kernel`.
     """
 
     factor_type: FactorType
@@ -57,6 +58,8 @@ class FactorBatch:
             raise SolverError(f"{self.name}: every array needs {n} rows, got {wrong}")
         if set(self.data) != set(self.factor_type.data):
             raise SolverError(f"{self.name}: needs data {self.factor_type.data}, got {tuple(self.data)}")
+        if not isinstance(self.kernel, Kernel):
+            raise SolverError(f"{self.name}: kernel must be a Kernel such as Kernel('huber', 1.0), got {self.kernel!r}")
 
     @classmethod
     def create(
@@ -73,7 +76,8 @@ class FactorBatch:
         """Build a batch, broadcasting scalar ``sigma`` and ``weight`` to all rows.
 
         Raises:
-            SolverError: If a sigma is not positive, a weight or a row is negative, or a datum has another shape.
+            SolverError: If a sigma is not positive, a weight or a row is negative, a datum has another shape, or the
+                kernel is no :class:`Kernel`.
         """
         n = len(slots[0].rows)
         sigma_array = np.broadcast_to(np.asarray(sigma, dtype=np.float64), np.shape(sigma) or (n,))
@@ -110,6 +114,23 @@ class FactorBatch:
             sigma=self.sigma[rows],
             weight=self.weight[rows],
         )
+
+    def check_rows(self, state: State) -> None:
+        """Check that a state has every variable that the factors read.
+
+        Raises:
+            SolverError: If it does not; names the term and the variable.
+        """
+        for slot in self.slots:
+            try:
+                count = len(state[slot.variable])
+            except SolverError as error:
+                raise SolverError(f"{self.name}: {error}") from None
+            if len(slot.rows) and (row := int(slot.rows.max())) >= count:
+                raise SolverError(
+                    f"{self.name} reads {_absent(slot.variable, row, state)}, which the problem does not have; "
+                    f"give rows below {count}"
+                )
 
     def gather(self, state: State) -> list[FloatArray]:
         """Return the variables of every row, one array per slot."""
@@ -205,3 +226,11 @@ class FactorBatch:
     def describe_row(self, row: int, state: State) -> str:
         """Return the decoded variables of one factor: "camera pose, frame 3 and landmark, track 17"."""
         return " and ".join(state.describe(s.variable, int(s.rows[row])) for s in self.slots)
+
+
+def _absent(variable: VariableType, row: int, state: State) -> str:
+    """Return words for a row that a state does not have: the variable itself where rows are the numbers of its keys."""
+    counted = State({variable: state[variable]}).numbers(variable)
+    if not np.array_equal(state.numbers(variable), counted):
+        return f"row {row} of {variable}"
+    return f"row {row} of {variable} ({variable.describe(row, *(0 for _ in variable.index[1:]))})"

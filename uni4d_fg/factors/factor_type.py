@@ -126,7 +126,8 @@ class FactorType:
             **data: Measurements, N rows each.
 
         Raises:
-            SolverError: If a shape does not fit, or a number is not finite, not positive or negative.
+            SolverError: If a shape does not fit, a number is not finite, not positive or negative, or the kernel is no
+                :class:`~uni4d_fg.factors.kernels.Kernel`.
         """
         from uni4d_fg.factors.batch import FactorBatch, Slot
 

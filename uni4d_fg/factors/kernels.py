@@ -17,21 +17,35 @@ weight of the paper's unsquared norm. It tends to ``s`` as c tends to 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from numbers import Real
+from typing import Literal, get_args
 
 import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
+from uni4d_fg.errors import SolverError
 
 KernelKind = Literal["quadratic", "huber", "pseudo_huber", "cauchy", "norm"]
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A robust kernel and its threshold c (whitened units)."""
+    """A robust kernel and its threshold c (whitened units).
+
+    Raises:
+        SolverError: On construction, if there is no such kernel, or the threshold is not finite and positive.
+    """
 
     kind: KernelKind = "quadratic"
     threshold: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(KernelKind):
+            raise SolverError(f"there is no kernel {self.kind!r}; choose one of {', '.join(get_args(KernelKind))}")
+        if not (isinstance(self.threshold, Real) and 0.0 < self.threshold < np.inf):
+            raise SolverError(
+                f"kernel '{self.kind}': the threshold must be finite and positive, got {self.threshold!r}"
+            )
 
     def rho(self, squared: Array) -> Array:
         """Evaluate the kernel at squared norms s^2, NumPy or torch; same shape, with a finite gradient at zero."""

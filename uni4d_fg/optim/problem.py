@@ -48,13 +48,14 @@ class Problem:
 
         Args:
             factors: Batches, ``gtsam`` factors and graphs, and iterables of these.
-            state: Names the keys of ``gtsam`` factors; needed for these.
+            state: Names the keys of ``gtsam`` factors; needed for these. Batches are checked against it.
 
         Returns:
             Itself.
 
         Raises:
-            SolverError: If a ``gtsam`` factor reads a key that the state does not have, or no state is given.
+            SolverError: If a factor reads a variable that the state does not have, no state is given for a ``gtsam``
+                factor, or something is no factor.
         """
         batches, native = [], []
         for item in flat_factors(factors):
@@ -68,6 +69,8 @@ class Problem:
                     "a factor of GTSAM's needs the state whose keys it reads: problem.add(f, state=state)"
                 )
             batches += native_batches(native, state)
+        if state is not None:
+            check_rows(batches, state)
         self.batches = (*self.batches, *batches)
         return self
 
@@ -127,12 +130,28 @@ def all_free(state: State, *variables: VariableType) -> dict[VariableType, BoolA
     return {variable: np.ones((len(state[variable]), variable.dim), dtype=bool) for variable in variables}
 
 
+def check_rows(batches: Iterable[FactorBatch], state: State) -> None:
+    """Check that a state has every variable that factors read.
+
+    Raises:
+        SolverError: If it does not; names the term and the variable.
+    """
+    for batch in batches:
+        batch.check_rows(state)
+
+
 def flat_factors(items: Iterable[Any]) -> Iterable[Any]:
-    """Yield the single batches and ``gtsam`` factors of nested iterables and graphs."""
+    """Yield the single batches and ``gtsam`` factors of nested iterables and graphs.
+
+    Raises:
+        SolverError: If something else is in them.
+    """
     for item in items:
         if isinstance(item, gtsam.NonlinearFactorGraph):
             yield from (item.at(i) for i in range(item.size()) if item.at(i) is not None)
         elif isinstance(item, FactorBatch | gtsam.NonlinearFactor):
             yield item
-        else:
+        elif isinstance(item, Iterable) and not isinstance(item, str):
             yield from flat_factors(item)
+        else:
+            raise SolverError(f"a batch of factors or a factor of GTSAM's is expected, got {type(item).__name__}")

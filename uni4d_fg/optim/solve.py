@@ -13,7 +13,7 @@ from uni4d_fg.factors.variable import VariableType
 from uni4d_fg.optim.backend import BackendChoice, choose_backend
 from uni4d_fg.optim.block import BlockObjective
 from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.problem import Problem
+from uni4d_fg.optim.problem import Problem, check_rows
 from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary
 
@@ -38,9 +38,11 @@ def solve(
         The best state found, and a summary: why it ended, energies per term, what solved which terms.
 
     Raises:
-        SolverError: If a factor is not finite or the system is singular; names the variables.
+        SolverError: If a factor is not finite or reads a variable that the state does not have, or the system is
+            singular; names the variables.
         MissingDependencyError: If 'cpp' is asked for and not installed.
     """
+    check_rows(problem.batches, state)
     return run_stage(Stage("problem", problem, config or SolverConfig()), state, hooks, choose_backend(backend))
 
 
@@ -59,8 +61,10 @@ def marginals(problem: Problem, state: State, variable: VariableType, rows: list
         (n, d, d) in the variables' tangents; zero rows and columns for frozen entries.
 
     Raises:
-        SolverError: If the factors do not determine every free entry, or a factor is not finite.
+        SolverError: If the factors do not determine every free entry, or a factor is not finite or reads a variable
+            that the state does not have.
     """
+    check_rows(problem.batches, state)
     objective = BlockObjective(problem, state, SolverConfig())
     linearization = objective.linearize(state)
     hessian = (linearization.matrix.T @ linearization.matrix).toarray()
