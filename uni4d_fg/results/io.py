@@ -79,13 +79,14 @@ def _arrays(reconstruction: Reconstruction) -> dict[str, npt.NDArray[Any]]:
     return arrays | {name: np.asarray(array) for name, array in known.items() if array is not None}
 
 
-def load_reconstruction(path: Path) -> Reconstruction:
+def load_reconstruction(path: str | Path) -> Reconstruction:
     """Read a reconstruction and check it.
 
     Raises:
         InputError: If the file is missing, damaged, of a newer format, or holds arrays whose shapes
             disagree, values that are not finite where they must be, or poses that are not rigid.
     """
+    path = Path(path)
     version = load_npz(path, {"format_version": 0}, {})["format_version"]
     if version != FORMAT_VERSION:
         raise InputError(

@@ -239,7 +239,7 @@ class Run:
 
     def _load_sequence(self) -> Sequence | Video:
         if self._read_sequence is None:
-            raise InputError("its sequence was not given")
+            raise InputError("its sequence was not given; open the run with Run(folder, read_sequence)")
         sequence = self._read_sequence()
         found = (sequence.num_frames, *sequence.image_size)
         expected = (self.num_frames, *self.reconstruction.image_size)

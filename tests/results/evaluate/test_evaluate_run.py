@@ -280,3 +280,8 @@ def test_depth_is_compared_with_itself_without_any_truth(
     assert cue.mean == pytest.approx(0.0, abs=1e-6)
     lines = format_report(report).split("Depth against itself\n")[1].splitlines()
     assert lines[2].split() == ["fused", "0.0039", "80.00", "%", "100.00", "%"]
+
+
+def test_a_folder_may_be_a_text(truth_and_run: tuple[Sequence, Reconstruction, Path]) -> None:
+    sequence, _, run = truth_and_run
+    assert evaluate_run(str(run), sequence).to_dict() == evaluate_run(run, sequence).to_dict()

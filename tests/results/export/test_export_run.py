@@ -21,6 +21,7 @@ from uni4d_fg.results.export.frames import frame_names, write_images
 from uni4d_fg.results.export.model import Exporter, ExportJob, ExportOptions
 from uni4d_fg.results.export.registry import FORMATS
 from uni4d_fg.results.run import Run
+from uni4d_fg.results.shot_list import Shot, write_shots
 
 Cli = Callable[..., tuple[int, str, str]]
 
@@ -213,3 +214,21 @@ def test_names_that_would_not_sort_or_not_parse_become_numbers(
 ) -> None:
     job = _job(source, tmp_path, source.need_sequence().images, stems)
     assert frame_names(job.run)[0] == "00000"
+
+
+def test_a_run_is_opened_by_its_folder(finished_run: Path, tmp_path: Path) -> None:
+    (report,) = export_run(str(finished_run), ["tum"], str(tmp_path / "text"))
+    assert report.folder == tmp_path / "text" / "tum"
+    export_run(finished_run, ["tum"], tmp_path / "path")
+    written = [(tmp_path / name / "tum" / "trajectory.txt").read_bytes() for name in ("text", "path")]
+    assert written[0] == written[1]
+    with pytest.raises(InputError, match=r"its sequence was not given; open the run with Run\(folder, read_sequence\)"):
+        export_run(str(finished_run), ["colmap"], tmp_path / "out")
+    with pytest.raises(InputError, match="no such folder"):
+        export_run(str(tmp_path / "nosuch"), ["tum"])
+
+
+def test_shots_of_a_split_run_are_exported_one_by_one(tmp_path: Path) -> None:
+    write_shots(tmp_path, [Shot("shots/000", 0, 6, 6)])
+    with pytest.raises(InputError, match="a run in several shots; give the folder of one of them"):
+        export_run(tmp_path, ["tum"])

@@ -81,7 +81,7 @@ class _Unavailable(Exception):
     """A part cannot be scored; the message says why."""
 
 
-def evaluate_run(run_dir: Path, sequence: Sequence, *, max_depth_m: float = 70.0) -> EvaluationReport:
+def evaluate_run(run_dir: str | Path, sequence: Sequence, *, max_depth_m: float = 70.0) -> EvaluationReport:
     """Score the results of a run against its sequence's ground truth.
 
     Args:
@@ -92,7 +92,7 @@ def evaluate_run(run_dir: Path, sequence: Sequence, *, max_depth_m: float = 70.0
     Raises:
         InputError: If the run is unreadable or has another number of frames than the sequence.
     """
-    folder = RunFolder(run_dir)
+    folder = RunFolder(Path(run_dir))
     reconstruction = load_reconstruction(folder.reconstruction)
     if reconstruction.num_frames != sequence.num_frames:
         raise InputError(

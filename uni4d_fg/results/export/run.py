@@ -15,13 +15,14 @@ from uni4d_fg.results.export.model import ExportJob, ExportOptions, ExportReport
 from uni4d_fg.results.export.registry import exporter
 from uni4d_fg.results.run import Run
 from uni4d_fg.results.run_contents import EXPORT_MARKER, export_files, foreign_files, is_export
+from uni4d_fg.results.shot_list import refuse_split
 from uni4d_fg.results.undistort import undistorted
 
 
 def export_run(
-    run: Run,
+    run: Run | str | Path,
     formats: Iterable[str],
-    out: Path | None = None,
+    out: str | Path | None = None,
     options: ExportOptions | None = None,
     *,
     overwrite: bool = False,
@@ -31,7 +32,8 @@ def export_run(
     """Write a run in the formats of other programs.
 
     Args:
-        run: The run.
+        run: The run, or its folder: that does for formats without images. Those with images need a :class:`Run` that
+            knows how to open its sequence.
         formats: Names in :data:`uni4d_fg.results.export.registry.FORMATS`.
         out: Each format gets a folder of its name in here; ``export`` in the run's folder if None.
         options: Choices.
@@ -43,13 +45,17 @@ def export_run(
         One report per format, in the order asked for.
 
     Raises:
-        InputError: If a format is unknown, or something that it needs is missing or damaged.
+        InputError: If a format is unknown, the run cannot be opened, or something that a format needs is missing or
+            damaged.
         OutputError: If a folder is in the way, or a file cannot be written. Formats before it are kept.
         MissingDependencyError: If a format needs a package that is not installed.
         Cancelled: If ``should_stop`` turned true.
     """
     chosen = {name: exporter(name) for name in formats}
-    root = run.folder.exports if out is None else out
+    if not isinstance(run, Run):
+        refuse_split(Path(run))
+        run = Run(Path(run))
+    root = run.folder.exports if out is None else Path(out)
     for name, one in chosen.items():
         one.require()
         _check_target(root / name, overwrite)
