@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 
 from uni4d_fg.config import Config
 from uni4d_fg.config.describe import describe_fields, field_paths, find_field
-from uni4d_fg.config.load import dump_config, load_config, preset_names, presets_folder, with_overrides
+from uni4d_fg.config.load import (
+    dump_config,
+    load_config,
+    opened_config,
+    preset_names,
+    presets_folder,
+    with_overrides,
+)
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.synthetic import SyntheticSceneConfig
@@ -259,6 +266,23 @@ def test_either_energy_may_lose_a_term_and_change_its_numbers() -> None:
     assert (squared.camera_init.kernel.kind, squared.energy) == ("quadratic", "paper")
     robust = load_config("default", ["nonrigid.depth_prior=false", "nonrigid.arap_kernel.kind=cauchy"])
     assert not robust.nonrigid.depth_prior
+
+
+def test_one_text_is_no_list_of_overrides() -> None:
+    said = r"a list of section.field=VALUE is expected, such as \['nonrigid.neighbors=3'\], not one text"
+    with pytest.raises(ConfigError, match=said):
+        load_config("fast", "nonrigid.neighbors=3")
+    with pytest.raises(ConfigError, match=said):
+        with_overrides(Config(), "nonrigid.neighbors=3")
+
+
+def test_a_configuration_is_opened_by_name_or_taken_as_it_is(tmp_path: Path) -> None:
+    fast = load_config("fast")
+    assert opened_config(fast) is fast
+    assert opened_config("fast") == opened_config(write(tmp_path / "mine.yaml", "preset: fast")) == fast
+    assert opened_config(None, ["nonrigid.neighbors=3"]).nonrigid.neighbors == 3
+    with pytest.raises(ConfigError, match="built already takes none"):
+        opened_config(fast, ["nonrigid.neighbors=3"])
 
 
 @settings(max_examples=60, deadline=None)

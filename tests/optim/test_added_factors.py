@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from uni4d_fg.config.solver import SolverConfig
+from uni4d_fg.errors import SolverError
 from uni4d_fg.factors.priors import log_scale_deviation, log_scale_prior
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import CUE_SCALE, LOG_SCALE
-from uni4d_fg.optim.added_factors import HOLDS_SCALE, AddingRunner, Addition, adding_to, joined_by
+from uni4d_fg.optim.added_factors import HOLDS_SCALE, AddingRunner, Addition, adding_to, checked_sources, joined_by
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage, run_stage
 
@@ -74,3 +77,71 @@ def test_a_stage_as_it_was_solved_has_what_every_source_added() -> None:
     np.testing.assert_allclose(whole.state[LOG_SCALE], solved[LOG_SCALE])
     alone = joined_by(run_stage, declared, state)
     assert (alone.stage, alone.state) == (declared, state)
+
+
+@pytest.mark.parametrize(
+    ("index", "said"),
+    [
+        (
+            {},
+            r"^log_scale_prior reads row 4 of log_scale \(depth log-scale, frame 4\), .*; give rows below 3$",
+        ),
+        (
+            {LOG_SCALE: np.array([10, 11, 12])},
+            "^log_scale_prior reads row 4 of log_scale, which the problem",
+        ),
+    ],
+)
+def test_a_factor_on_frames_that_are_not_there_is_named(index: dict[Any, Any], said: str) -> None:
+    declared, state = stage()
+    added = log_scale_prior(np.arange(5), measured=np.zeros((5, 1)), sigma=0.1)
+    with pytest.raises(SolverError, match=said):
+        AddingRunner(run_stage, [lambda _, __: Addition([added])])(declared, State(state.arrays, index))
+
+
+def test_a_factor_on_variables_that_are_not_there_is_named() -> None:
+    declared, state = stage()
+    added = log_scale_deviation([0], 0, sigma=0.1)
+    with pytest.raises(SolverError, match="log_scale_deviation: the state has no cue_scale variables"):
+        AddingRunner(run_stage, [lambda _, __: Addition([added], is_metric=False)])(declared, state)
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (5, "structure: the source positions returned int, but an Addition or None is expected"),
+        (observed(), "positions returned list"),
+        (Addition([5]), "a batch of factors or a factor of GTSAM's is expected, got int"),
+        (Addition("prior"), "a batch of factors or a factor of GTSAM's is expected, got str"),
+    ],
+)
+def test_what_a_source_returns_must_be_an_addition_of_factors(found: Any, said: str) -> None:
+    declared, state = stage()
+
+    def positions(_: Stage, __: State) -> Any:
+        return found
+
+    with pytest.raises(SolverError, match=said):
+        AddingRunner(run_stage, [positions])(declared, state)
+
+
+def test_additions_are_a_list_of_functions() -> None:
+    def positions(_: Stage, __: State) -> None:
+        return None
+
+    assert checked_sources(source for source in [positions]) == (positions,)
+    wrong: list[tuple[Any, str]] = [
+        (positions, r"not one alone; give \[positions\]"),
+        (5, "a list of sources is expected, got int"),
+        (None, "a list of sources is expected, got NoneType"),
+        (["x"], "a source is a function of stage and state .*, got str"),
+        ([Addition([])], "got Addition"),
+    ]
+    for additions, said in wrong:
+        with pytest.raises(SolverError, match=f"^additions: .*{said}"):
+            checked_sources(additions)
+
+
+def test_the_kernel_of_a_factor_is_no_name() -> None:
+    with pytest.raises(SolverError, match=r"log_scale_prior: kernel must be a Kernel such as .*, got 'huber'"):
+        log_scale_prior([0], measured=np.zeros((1, 1)), kernel="huber")  # type: ignore[arg-type]

@@ -11,11 +11,17 @@ import pytest
 from pipeline_scenes import NO_VIEWS, TINY, make_scene
 
 import uni4d_fg as fg
-from uni4d_fg.errors import InputError, OutputError
+from uni4d_fg.errors import ConfigError, InputError, OutputError, SolverError
 from uni4d_fg.results.run import Run
 from uni4d_fg.results.run_contents import MARKER
 from uni4d_fg.results.shot_list import Shot, write_shots
 from uni4d_fg.slam.reconstruction import Reconstruction
+
+
+@fg.factor(fg.variables.POSE, data={"xyz": 3}, dim=3)
+def measured_center(world_T_cam: Any, *, xyz: Any) -> Any:
+    """Where a camera is, minus where it was measured, meters."""
+    return world_T_cam[..., :3, 3] - xyz
 
 
 def reconstruct(run: Path, **options: Any) -> Reconstruction:
@@ -83,3 +89,25 @@ def test_what_cannot_be_solved_does_not_cost_an_earlier_run(tmp_path: Path) -> N
     with pytest.raises(InputError, match="odometry"):
         reconstruct(tmp_path, overwrite=True, measurements=measured)
     assert contents(tmp_path) == before
+
+
+def test_wrong_arguments_are_named_before_anything_is_made(tmp_path: Path) -> None:
+    run, scene = tmp_path / "run", make_scene(TINY)
+    with pytest.raises(ConfigError, match=r"a list of section.field=VALUE is expected, such as \['solver=lm'\]"):
+        fg.reconstruct(scene, run, "fast", "solver=lm")
+    with pytest.raises(ConfigError, match="built already takes none"):
+        fg.reconstruct(scene, run, fg.load_config("fast"), ["solver=lm"])
+    with pytest.raises(SolverError, match="additions: a list of sources is expected, not one alone"):
+        fg.reconstruct(scene, run, "fast", additions=lambda stage, state: None)  # type: ignore[arg-type]
+    assert not run.exists()
+
+
+def test_own_factors_on_more_frames_than_there_are(tmp_path: Path) -> None:
+    def positions(stage: Any, state: Any) -> fg.Addition | None:
+        measured = np.zeros((8, 3))
+        return fg.Addition([measured_center(np.arange(8), xyz=measured, sigma=0.05)]) if stage.finds_cameras else None
+
+    with pytest.raises(
+        SolverError, match=r"measured_center reads row 7 of pose \(camera pose, frame 7\).*rows below 6"
+    ):
+        reconstruct(tmp_path, additions=[positions])

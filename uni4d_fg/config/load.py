@@ -64,6 +64,19 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
     return _build(Config, Config(), layers, overrides)
 
 
+def opened_config(config: Config | str | Path | None, overrides: Sequence[str] = ()) -> Config:
+    """Return a configuration as it is, or build what is named, as :func:`load_config` does.
+
+    Raises:
+        ConfigError: As :func:`load_config`, or if a configuration that is built already comes with overrides.
+    """
+    if not isinstance(config, Config):
+        return load_config(config, overrides)
+    if overrides:
+        raise ConfigError("changes: a configuration that is built already takes none; give them to load_config")
+    return config
+
+
 def with_overrides(section: SectionT, overrides: Sequence[str]) -> SectionT:
     """Return a section with ``field=VALUE`` overrides applied.
 
@@ -82,6 +95,8 @@ def dump_config(config: Section) -> str:
 def _build(
     model: type[SectionT], start: SectionT, layers: list[tuple[str, dict[str, Any]]], overrides: Sequence[str]
 ) -> SectionT:
+    if isinstance(overrides, str):
+        raise ConfigError(f"changes: a list of section.field=VALUE is expected, such as [{overrides!r}], not one text")
     values: dict[str, Any] = start.model_dump(mode="json")
     sources: list[tuple[tuple[str, ...], str]] = []
     for source, layer in layers:

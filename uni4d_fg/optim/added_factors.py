@@ -123,9 +123,10 @@ def join_additions(
         kept: Added variables, all known, that must be there though no source names them: those of a prior.
 
     Raises:
-        SolverError: If a source declares a variable that the stage has, or a factor does not fit.
+        SolverError: If a source returns something else than an addition, declares a variable that the stage has, or a
+            factor does not fit.
     """
-    additions = [found for source in sources if (found := source(stage, state)) is not None]
+    additions = [found for source in sources if (found := _asked(source, stage, state)) is not None]
     if not additions and not kept:
         return JoinedStage(stage, state)
     is_metric = any(addition.is_metric for addition in additions)
@@ -142,6 +143,41 @@ def join_additions(
     left_out = _add_factors(problem, additions, joined, state)
     added = tuple(variable for variable in joined.arrays if variable not in state)
     return JoinedStage(replace(stage, problem=problem), joined, added, is_metric, left_out)
+
+
+def checked_sources(additions: Iterable[FactorSource]) -> tuple[FactorSource, ...]:
+    """Return what a caller gave as its additions, as sources.
+
+    Raises:
+        SolverError: If that is no list of functions.
+    """
+    if callable(additions):
+        raise SolverError(f"additions: a list of sources is expected, not one alone; give [{_name(additions)}]")
+    if not isinstance(additions, Iterable):
+        raise SolverError(f"additions: a list of sources is expected, got {_name(additions)}")
+    sources = tuple(additions)
+    for source in sources:
+        if not callable(source):
+            raise SolverError(
+                f"additions: a source is a function of stage and state that returns an Addition or None, got "
+                f"{_name(source)}"
+            )
+    return sources
+
+
+def _asked(source: FactorSource, stage: Stage, state: State) -> Addition | None:
+    """Return what a source says of a stage."""
+    found = source(stage, state)
+    if found is not None and not isinstance(found, Addition):
+        raise SolverError(
+            f"{stage.name}: the source {_name(source)} returned {_name(found)}, but an Addition or None is expected"
+        )
+    return found
+
+
+def _name(thing: Any) -> str:
+    """Return the name of a function, or of the type of anything else."""
+    return str(getattr(thing, "__name__", type(thing).__name__))
 
 
 def _joined_state(

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from uni4d_fg.config.load import load_config
+from uni4d_fg.config.load import opened_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import settings_for_depth
 from uni4d_fg.cues.gather import gather_cues
@@ -16,7 +16,7 @@ from uni4d_fg.frontend.sequence import model
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.shots.cuts import find_cuts
-from uni4d_fg.optim.added_factors import FactorSource
+from uni4d_fg.optim.added_factors import FactorSource, checked_sources
 from uni4d_fg.pipeline.asked import check_asked
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
@@ -77,7 +77,8 @@ def reconstruct(
             the message says what, where and what to do.
     """
     folder = Path(run)
-    settings = config if isinstance(config, Config) else load_config(config, changes)
+    settings = opened_config(config, changes)
+    sources = checked_sources(additions)
     samples = read_imu(Path(imu)) if isinstance(imu, str | Path) else imu
     files = measurements or MeasurementFiles()
     # What is wrong is said before anything is made, or an earlier run is replaced.
@@ -112,6 +113,6 @@ def reconstruct(
         cues = None if report is None else report.to_dict()
         reconstruct_sequence(
             sequence, folder, settings_for_depth(settings, sequence), resume=resume, reporter=reporter, cues=cues,
-            additions=additions, measurements=files, imu=samples, warnings=warnings, workers=workers,
+            additions=sources, measurements=files, imu=samples, warnings=warnings, workers=workers,
         )  # fmt: skip
     return load_reconstruction(RunFolder(folder).reconstruction)

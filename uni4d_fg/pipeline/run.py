@@ -34,7 +34,7 @@ from uni4d_fg.frontend.tracks.cache import load_or_track
 from uni4d_fg.frontend.tracks.io import save_tracks
 from uni4d_fg.frontend.tracks.labels import label_tracks
 from uni4d_fg.geometry.lens import Lens
-from uni4d_fg.optim.added_factors import FactorSource, fingerprints, with_additions
+from uni4d_fg.optim.added_factors import FactorSource, checked_sources, fingerprints, with_additions
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.runners import solver_facts, solver_settings, stage_runner
 from uni4d_fg.optim.stage import StageRunner
@@ -133,6 +133,7 @@ def reconstruct(
     check_sequence(sequence)
     check_asked(sequence, config, imu, workers)
     check_given_cues(sequence, config.input)
+    own = checked_sources(additions)
     recorder = RecordingRunner(stage_runner(config), KEPT)
     # Threads of BLAS wait for each other in busy loops: on a busy machine small matrices take a thousand times as long.
     # What is worth several threads divides its work itself.
@@ -140,7 +141,7 @@ def reconstruct(
         mark_run(run_dir)
         return _reconstruct(
             recorder, sequence, run_dir, config, resume, reporter or SilentReporter(), should_stop or (lambda: False),
-            cues or {}, additions, measurements or MeasurementFiles(), imu, warnings, workers,
+            cues or {}, own, measurements or MeasurementFiles(), imu, warnings, workers,
         )  # fmt: skip
 
 

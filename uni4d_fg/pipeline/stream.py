@@ -17,7 +17,7 @@ from uni4d_fg.errors import Cancelled, ConfigError
 from uni4d_fg.files import atomic_write_json, atomic_write_text, remove_file
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.naming import order_warnings
-from uni4d_fg.optim.added_factors import FactorSource
+from uni4d_fg.optim.added_factors import FactorSource, checked_sources
 from uni4d_fg.pipeline.assemble import write_result
 from uni4d_fg.pipeline.checks import check_sequence
 from uni4d_fg.pipeline.leftovers import remove_leftovers
@@ -161,7 +161,7 @@ def stream_sequence(
     with run_lock(run_dir):
         mark_run(run_dir)
         measured = read_measurements(measurements or MeasurementFiles(), sequence.timestamps, config.measurements)
-        sources = (*additions, *measured.sources)
+        sources = (*checked_sources(additions), *measured.sources)
         summary = _stream(sequence, run_dir, config, resume, on_frame, should_stop, sources)
         summary = replace(
             summary,

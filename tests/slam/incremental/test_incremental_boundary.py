@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stream_samples import no_tracks, stream, stream_config, tracks_of
 
-from uni4d_fg.errors import InputError, SolverError
+from uni4d_fg.config.load import load_config
+from uni4d_fg.errors import ConfigError, InputError, SolverError
 from uni4d_fg.slam.incremental import FrameTracks, IncrementalReconstructor
 from uni4d_fg.slam.incremental.dynamic import DynamicWindow
 
@@ -162,3 +163,14 @@ def test_any_small_array_is_refused_or_taken(shape: tuple[int, ...], dtype: str,
         solver.add_frame(**{**good, name: np.zeros(shape, dtype)})
     except InputError as error:
         assert str(error).startswith("frame 0: ")  # noqa: PT017 - taking it is right too
+
+
+def test_a_preset_is_taken_by_its_name() -> None:
+    sequence = stream(FRAMES, **FEW)
+    arguments = (sequence.intrinsics, sequence.image_size)
+    assert IncrementalReconstructor(*arguments, "fast").config == load_config("fast")
+    assert IncrementalReconstructor(*arguments).config == load_config()
+    with pytest.raises(ConfigError, match="fsat: no such preset or file; did you mean fast"):
+        IncrementalReconstructor(*arguments, "fsat")
+    with pytest.raises(SolverError, match="additions: a list of sources is expected"):
+        IncrementalReconstructor(*arguments, additions=lambda stage, state: None)  # type: ignore[arg-type]

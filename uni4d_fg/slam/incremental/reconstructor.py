@@ -6,16 +6,18 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
 from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
+from uni4d_fg.config.load import opened_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.errors import ConfigError, InputError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.lens import PINHOLE, Lens
-from uni4d_fg.optim.added_factors import FactorSource
+from uni4d_fg.optim.added_factors import FactorSource, checked_sources
 from uni4d_fg.optim.backend import choose_backend
 from uni4d_fg.optim.stage import LevenbergMarquardtRunner
 from uni4d_fg.slam.incremental.boundary import Boundary, checked_size, detached
@@ -83,26 +85,29 @@ class IncrementalReconstructor:
     Args:
         intrinsics: (4,) fx, fy, cx, cy, px: known, or a starting value when ``input.intrinsics`` is free.
         image_size: (height, width), px.
-        config: The whole configuration; ``incremental`` has the window, the rest is that of the batch stages.
+        config: A configuration, the name of a preset, or a YAML file; the default preset when None. ``incremental`` has
+            the window, the rest is that of the batch stages.
         results: Takes what leaves the window; kept in memory when None.
         additions: Factors and variables of your own, asked for before every solve of the window; keys count frames from
             the first, see :mod:`uni4d_fg.optim.added_factors`. Frames that are no keyframes are in no solve.
         lens: Distortion of the images; it goes with the intrinsics, which are held where there is any.
 
     Raises:
-        ConfigError: If the configuration asks for what cannot be done in a window.
+        ConfigError: If there is no such configuration, or it asks for what cannot be done in a window.
         InputError: If the intrinsics are not usable.
+        SolverError: If the additions are no list of functions.
     """
 
     def __init__(
         self,
         intrinsics: FloatArray,
         image_size: tuple[int, int],
-        config: Config,
+        config: Config | str | Path | None = None,
         results: Results | None = None,
         additions: Iterable[FactorSource] = (),
         lens: Lens = PINHOLE,
     ):
+        config = opened_config(config)
         check_incremental(config)
         intrinsics = np.array(intrinsics, dtype=np.float64)
         if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
@@ -113,7 +118,7 @@ class IncrementalReconstructor:
         self.config, self.lens, self.image_size = config, lens, checked_size(image_size)
         ba = config.bundle_adjustment
         noise = StaticNoise(ba.reprojection_sigma_px, ba.depth_sigma, ba.depth_correlation)
-        self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise, sources=tuple(additions))
+        self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise, sources=checked_sources(additions))
         self.dynamic = DynamicWindow(config, depth_sigma=ba.depth_sigma)
         self.book = TrackBook()
         self.tracker = OnlineTracker(config.tracking, config.incremental.max_live_tracks)
