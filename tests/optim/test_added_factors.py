@@ -84,11 +84,11 @@ def test_a_stage_as_it_was_solved_has_what_every_source_added() -> None:
     [
         (
             {},
-            r"^log_scale_prior reads row 4 of log_scale \(depth log-scale, frame 4\), .*; give rows below 3$",
+            r"^log_scale_prior reads row 3 of log_scale \(depth log-scale, frame 3\), .*; give rows below 3$",
         ),
         (
             {LOG_SCALE: np.array([10, 11, 12])},
-            "^log_scale_prior reads row 4 of log_scale, which the problem",
+            "^log_scale_prior reads row 3 of log_scale, which the problem",
         ),
     ],
 )

@@ -104,7 +104,7 @@ def test_terms_of_one_name_add_up_and_exact_leaves_out_the_smoothing(rng: np.ran
 
 def test_rows_that_the_state_does_not_have_are_named(state: State) -> None:
     far = log_scale_prior(np.arange(6), measured=np.zeros((6, 1)), sigma=0.1)
-    said = r"log_scale_prior reads row 5 of log_scale \(depth log-scale, frame 5\), which the problem does not have"
+    said = r"log_scale_prior reads row 4 of log_scale \(depth log-scale, frame 4\), which the problem does not have"
     problem = Problem.over(state).add(far)
     with pytest.raises(SolverError, match=said):
         solve(problem, state)

@@ -108,6 +108,6 @@ def test_own_factors_on_more_frames_than_there_are(tmp_path: Path) -> None:
         return fg.Addition([measured_center(np.arange(8), xyz=measured, sigma=0.05)]) if stage.finds_cameras else None
 
     with pytest.raises(
-        SolverError, match=r"measured_center reads row 7 of pose \(camera pose, frame 7\).*rows below 6"
+        SolverError, match=r"measured_center reads row 6 of pose \(camera pose, frame 6\).*rows below 6"
     ):
         reconstruct(tmp_path, additions=[positions])

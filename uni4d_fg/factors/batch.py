@@ -126,7 +126,8 @@ class FactorBatch:
                 count = len(state[slot.variable])
             except SolverError as error:
                 raise SolverError(f"{self.name}: {error}") from None
-            if len(slot.rows) and (row := int(slot.rows.max())) >= count:
+            if len(slot.rows) and slot.rows.max() >= count:
+                row = int(slot.rows[slot.rows >= count].min())
                 raise SolverError(
                     f"{self.name} reads {_absent(slot.variable, row, state)}, which the problem does not have; "
                     f"give rows below {count}"
