@@ -59,6 +59,24 @@ def test_lengths_are_in_the_unit_of_the_depth(tmp_path: Path) -> None:
         assert (NOT_METRIC_GIVEN in found["warnings"]) is not metric
 
 
+def test_frames_that_are_too_far_at_the_start_lack_depth(tmp_path: Path) -> None:
+    given = stream(8)
+    far, nothing = (
+        replace(given, depths=[np.full_like(given.depths[0], value), *(given.depths[t] for t in range(1, 8))])
+        for value in (500.0, np.nan)
+    )
+    for name, sequence in (("far", far), ("nothing", nothing)):
+        stream_sequence(sequence, tmp_path / name, CONFIG)
+    assert_same(tmp_path / "far", tmp_path / "nothing")
+
+
+def test_a_principal_point_outside_the_image_is_said_before_a_run_is_touched(tmp_path: Path) -> None:
+    given = stream(8)
+    with pytest.raises(InputError, match="principal point"):
+        stream_sequence(replace(given, intrinsics=given.intrinsics * [1, 1, 10, 1]), tmp_path / "run", CONFIG)
+    assert not (tmp_path / "run").exists()
+
+
 def assert_same(folder: Path, expected: Path) -> None:
     """Assert that two streams hold the same reconstruction, number by number."""
     found, wanted = (load_reconstruction(f / "reconstruction.npz") for f in (folder, expected))

@@ -15,6 +15,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.scale_notes import NOT_METRIC_GIVEN
 from uni4d_fg.errors import Cancelled, ConfigError
 from uni4d_fg.files import atomic_write_json, atomic_write_text, remove_file
+from uni4d_fg.frontend.sequence.frame_checks import usable_depth
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.naming import order_warnings
 from uni4d_fg.optim.added_factors import FactorSource, checked_sources
@@ -31,6 +32,7 @@ from uni4d_fg.pipeline.usable_cues import check_given_cues
 from uni4d_fg.pipeline.warnings import scene_warnings, started_from_a_guess
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.incremental.boundary import checked_intrinsics
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor, check_incremental
 
@@ -96,7 +98,7 @@ def check_stream(sequence: Sequence, config: Config) -> None:
     """Check a sequence and a configuration before a folder is touched.
 
     Raises:
-        InputError: If parts of the sequence are missing or contradict each other.
+        InputError: If parts of the sequence are missing or contradict each other, or the principal point is outside.
         ConfigError: If it cannot be solved frame by frame, or asks for a camera model whose parameters are not given.
     """
     check_sequence(sequence)
@@ -111,6 +113,7 @@ def check_stream(sequence: Sequence, config: Config) -> None:
             "a stream finds its cameras itself: leave input.poses 'estimate', or use `uni4d-fg reconstruct`"
         )
     check_incremental(config)
+    checked_intrinsics(sequence.intrinsics, sequence.image_size)
 
 
 def not_in_streams(config: Config) -> list[str]:
@@ -200,7 +203,9 @@ def _stream(
             folder.save(solver, key)
             raise Cancelled(f"stopped before frame {frame}; --resume goes on from there")
         image, depth, mask = sequence.images[frame], sequence.depths[frame], sequence.masks[frame]
-        update = solver.add_frame(image, depth, mask, _tracks(sequence, frame), float(sequence.timestamps[frame]))
+        # Some frame has usable depth, as was checked: one that is too far at the start is a frame that lacks it.
+        usable = np.where(usable_depth(depth, config.input), depth, np.nan)
+        update = solver.add_frame(image, usable, mask, _tracks(sequence, frame), float(sequence.timestamps[frame]))
         key.take(image, depth, mask)
         counts[update.status.value] = counts.get(update.status.value, 0) + 1
         for part, value in update.seconds.items():

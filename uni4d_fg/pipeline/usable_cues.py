@@ -7,7 +7,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array
 from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.cues.plan import CuePlan
-from uni4d_fg.frontend.sequence.frame_checks import usable_depth
+from uni4d_fg.frontend.sequence.frame_checks import outside_limits, usable_depth
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 
@@ -65,12 +65,7 @@ def _check_depth(video: Video | Sequence, config: InputConfig) -> None:
             where, "is missing everywhere: no frame has a positive, finite value", "check how it was exported"
         )
     unit = "m" if video.depth_is_metric else "units"
-    raise SequenceProblem(
-        where,
-        f"lies outside {config.min_depth_m:g} to {config.max_depth_m:g} {unit} in every frame (its median is "
-        f"{np.median(medians):.4g}), and depth outside is treated as missing",
-        "check the unit: PNGs are in millimeters, .npy in meters; or set input.min_depth_m and input.max_depth_m",
-    )
+    raise SequenceProblem(where, *outside_limits(float(np.median(medians)), config, unit, "in every frame"))
 
 
 def _check_masks(video: Video | Sequence) -> None:

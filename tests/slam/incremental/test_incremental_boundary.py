@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stream_samples import no_tracks, stream, stream_config, tracks_of
 
 from uni4d_fg.config.load import load_config
-from uni4d_fg.errors import ConfigError, InputError, SolverError
+from uni4d_fg.errors import ConfigError, DegenerateProblemError, InputError, SolverError
 from uni4d_fg.slam.incremental import FrameTracks, IncrementalReconstructor
 from uni4d_fg.slam.incremental.dynamic import DynamicWindow
 
@@ -118,7 +118,8 @@ BAD: dict[str, list[Any]] = {
     ],
     "depth": [
         None, 1.0, np.zeros((*SIZE, 1)), np.zeros(SIZE, complex), np.full(SIZE, "far"), np.zeros(SIZE[::-1]),
-        np.zeros(SIZE, object),
+        np.zeros(SIZE, object), np.full(SIZE, 2500, np.uint16), np.full(SIZE, 2, np.int64),
+        np.full(SIZE, 2500.0), np.full(SIZE, 0.01), np.linspace(-3.0, -2.0, SIZE[0] * SIZE[1]).reshape(SIZE),
     ],
     "mask": [
         np.full(SIZE, 2**40), np.full(SIZE, -1), np.zeros(SIZE), np.zeros(SIZE[::-1], int), "mask",
@@ -145,6 +146,38 @@ def test_what_is_no_frame_is_one_clear_error(name: str, number: int) -> None:
 def test_what_is_no_image_size_is_one_clear_error(size: Any) -> None:
     with pytest.raises(InputError, match="image_size"):
         IncrementalReconstructor(np.array([150.0, 150.0, 80.0, 60.0]), size, stream_config())
+
+
+def test_depth_without_a_unit_and_depth_in_another_unit_are_told_apart() -> None:
+    solver = IncrementalReconstructor(np.array([150.0, 150.0, 80.0, 60.0]), SIZE, stream_config())
+    for depth, message in (
+        (np.full(SIZE, 2500, np.uint16), "frame 0: depth holds uint16 values of unknown unit; give meters as floats"),
+        (np.full(SIZE, 2500.0), r"frame 0: depth lies outside 0\.05 to 80 m in every pixel \(its median is 2500\)"),
+        (-np.linspace(1.0, 2.0, SIZE[1]) * np.ones((SIZE[0], 1)), "frame 0: depth is negative wherever it is finite"),
+    ):
+        with pytest.raises(InputError, match=message):
+            solver.add_frame(**{**GOOD, "depth": depth})
+    solver.add_frame(**GOOD)
+    later = {**GOOD, "depth": np.full(SIZE, 2500.0), "timestamp": 1.0}
+    assert solver.add_frame(**later).frame == 1, "a camera may turn to what is too far"
+
+
+@pytest.mark.parametrize("missing", [np.nan, 0.0, -1.0])
+def test_a_stream_without_any_depth_has_no_result(missing: float) -> None:
+    solver = IncrementalReconstructor(np.array([150.0, 150.0, 80.0, 60.0]), SIZE, stream_config())
+    nothing = {**GOOD, "depth": np.full(SIZE, missing)}
+    for time in (0.0, 0.0, 1.0):
+        solver.add_frame(**{**nothing, "timestamp": time})
+    with pytest.raises(DegenerateProblemError, match="none of the 2 frames has depth"):
+        solver.finish()
+    solver.add_frame(**{**GOOD, "timestamp": 2.0})
+    assert solver.finish().num_frames == 3
+
+
+@pytest.mark.parametrize("center", [(800.0, 60.0), (80.0, -1.0)])
+def test_a_principal_point_outside_the_image_is_refused(center: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match=r"principal point \(.*\) lies outside the image of 160 x 120 px"):
+        IncrementalReconstructor(np.array([150.0, 150.0, *center]), SIZE, stream_config())
 
 
 @settings(max_examples=25)

@@ -96,12 +96,22 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
     return mean
 
 
+def center_outside(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
+    """Say that the principal point of (4,) intrinsics is outside images of ``size`` (height, width), or return None."""
+    cx, cy = (float(v) for v in intrinsics[2:])
+    height, width = size
+    if 0 <= cx < width and 0 <= cy < height:
+        return None
+    return f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px"
+
+
 def implausible(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
     """Say what is odd about (4,) intrinsics for images of ``size`` (height, width), or return None."""
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     height, width = size
-    if not (0 <= cx < width and 0 <= cy < height):
-        return f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px"
+    outside = center_outside(intrinsics, size)
+    if outside is not None:
+        return outside
     if abs(cx - (width - 1) / 2) > 0.25 * width or abs(cy - (height - 1) / 2) > 0.25 * height:
         return f"principal point ({cx:.1f}, {cy:.1f}) is far from the center of the {width} x {height} px image"
     if not 0.2 * width < fx < 10 * width:

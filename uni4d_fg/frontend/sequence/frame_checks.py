@@ -40,11 +40,9 @@ def checked_depth(depth: Any, size: tuple[int, int], where: str) -> Float32Array
     """Return a depth map in meters as a new array of float32 in which all that is not positive and finite is NaN.
 
     Raises:
-        InputError: If it is not (H, W) numbers.
+        InputError: As :func:`floating_depth`.
     """
-    array = _of_size(depth, size, where)
-    if array.dtype.kind not in "iuf":
-        raise InputError(f"{where} has dtype {array.dtype}; give meters as floats")
+    array = floating_depth(depth, size, where)
     with np.errstate(over="ignore", invalid="ignore"):
         cleaned: Float32Array = array.astype(np.float32)
         cleaned[~((cleaned > 0) & np.isfinite(cleaned))] = np.nan
@@ -56,9 +54,28 @@ def usable_depth(depth: npt.NDArray[Any], limits: InputConfig) -> BoolArray:
     return np.asarray((depth >= limits.min_depth_m) & (depth <= limits.max_depth_m))
 
 
+def outside_limits(median: float, limits: InputConfig, unit: str, everywhere: str) -> tuple[str, str]:
+    """Say that all depth is outside the limits, and what to do.
+
+    Args:
+        median: Of the depth, in its unit.
+        limits: The limits.
+        unit: What to call the unit.
+        everywhere: Where it is outside.
+    """
+    return (
+        f"lies outside {limits.min_depth_m:g} to {limits.max_depth_m:g} {unit} {everywhere} (its median is "
+        f"{median:.4g}), and depth outside is treated as missing",
+        "check the unit: PNGs are in millimeters, .npy and arrays in meters; or set input.min_depth_m and "
+        "input.max_depth_m",
+    )
+
+
 def floating_depth(depth: Any, size: tuple[int, int], where: str) -> npt.NDArray[Any]:
     """Return a depth map as it is. Raises InputError if it is not (H, W) floats: whole numbers have no unit."""
     array = _of_size(depth, size, where)
+    if array.dtype.kind in "iu":
+        raise InputError(f"{where} holds {array.dtype} values of unknown unit; give meters as floats")
     if array.dtype.kind != "f":
         raise InputError(f"{where} has dtype {array.dtype}; give meters as floats")
     return array

@@ -13,9 +13,17 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array
-from uni4d_fg.errors import InputError, SolverError
-from uni4d_fg.frontend.sequence.frame_checks import checked_depth, checked_image, checked_mask
+from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
+from uni4d_fg.config.cues import InputConfig
+from uni4d_fg.errors import DegenerateProblemError, InputError, SolverError
+from uni4d_fg.frontend.sequence.calibration import center_outside
+from uni4d_fg.frontend.sequence.frame_checks import (
+    checked_depth,
+    checked_image,
+    checked_mask,
+    outside_limits,
+    usable_depth,
+)
 from uni4d_fg.slam.incremental.model import FrameTracks
 
 ValueT = TypeVar("ValueT")
@@ -39,10 +47,14 @@ class Boundary:
 
     Args:
         image_size: (height, width), px.
+        limits: Of depth.
     """
 
-    def __init__(self, image_size: tuple[int, int]) -> None:
+    def __init__(self, image_size: tuple[int, int], limits: InputConfig) -> None:
         self.image_size = image_size
+        self._limits = limits
+        self._without_depth = 0
+        """As long as no frame had usable depth, how many there were; -1 from then on."""
         self._closed: str | None = None
         self._tracks_given: bool | None = None
 
@@ -52,8 +64,8 @@ class Boundary:
         """Check the next frame and return a copy of it.
 
         Raises:
-            InputError: If an array has another shape or type than it must, the timestamp is not finite, or tracks are
-                given for some frames only.
+            InputError: If an array has another shape or type than it must, the timestamp is not finite, tracks are
+                given for some frames only, or there is depth for the first time, and all of it is outside the limits.
             SolverError: If no frame can be taken any more.
         """
         if self._closed is not None:
@@ -69,6 +81,8 @@ class Boundary:
             self._checked_tracks(where, number, tracks),
             time,
         )
+        if number <= self._without_depth:  # all others lacked it; a solve that was resumed may have seen some
+            self._without_depth = number + 1 if self._lacks_depth(f"{where}: depth", depth, frame.depth) else -1
         self._tracks_given = tracks is not None
         return frame
 
@@ -84,6 +98,14 @@ class Boundary:
             )
             raise
 
+    def check_finish(self, num_frames: int) -> None:
+        """Raise DegenerateProblemError if there were frames, and none had usable depth."""
+        if 0 < num_frames <= self._without_depth:
+            raise DegenerateProblemError(
+                f"none of the {num_frames} frames has depth, and without any there is no scene; give meters, and NaN "
+                "only where depth is missing"
+            )
+
     def close(self) -> None:
         """Take no more frames: the window was handed over."""
         self._closed = self._closed or "the stream was finished: no more frames can be added; start a new one"
@@ -97,6 +119,22 @@ class Boundary:
         if not np.isfinite(time):
             raise InputError(f"{where}: the timestamp {timestamp} is not finite; give seconds")
         return time
+
+    def _lacks_depth(self, where: str, given: Any, depth: Float32Array) -> bool:
+        """Tell whether a depth map is missing everywhere. Raises InputError if it is not, and none of it is usable."""
+        if usable_depth(depth, self._limits).any():
+            return False
+        known = depth[np.isfinite(depth)]
+        if known.size:
+            what, remedy = outside_limits(float(np.median(known)), self._limits, "m", "in every pixel")
+            raise InputError(f"{where} {what}; {remedy}")
+        given = np.asarray(given)
+        negative = given[np.isfinite(given) & (given < 0)]
+        if negative.size and negative.min() < negative.max():  # one number everywhere stands for "missing"
+            raise InputError(
+                f"{where} is negative wherever it is finite; give meters along the view, which are positive"
+            )
+        return True
 
     def _checked_tracks(self, where: str, number: int, tracks: FrameTracks | None) -> FrameTracks | None:
         if number and self._tracks_given is not None and self._tracks_given is not (tracks is not None):
@@ -127,6 +165,21 @@ def checked_size(image_size: Any) -> tuple[int, int]:
     if height < 1 or width < 1:
         raise InputError(f"image_size {image_size!r} must be positive px")
     return height, width
+
+
+def checked_intrinsics(intrinsics: Any, image_size: tuple[int, int]) -> FloatArray:
+    """Return a copy of intrinsics (4,) fx, fy, cx, cy, px, of images of ``image_size`` (height, width).
+
+    Raises:
+        InputError: If they are not finite, or a focal length is not positive, or the principal point is outside.
+    """
+    array = np.array(intrinsics, dtype=np.float64)
+    if array.shape != (4,) or not np.isfinite(array).all() or (array[:2] <= 0).any():
+        raise InputError(f"intrinsics must be fx, fy, cx, cy in px with positive focal lengths, got {array}")
+    outside = center_outside(array, image_size)
+    if outside is not None:
+        raise InputError(f"intrinsics: the {outside}; give fx, fy, cx, cy in px of these images")
+    return array
 
 
 def detached(value: ValueT) -> ValueT:

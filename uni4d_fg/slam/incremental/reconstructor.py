@@ -14,13 +14,13 @@ from uni4d_fg.allocation import return_free_memory
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
 from uni4d_fg.config.load import opened_config
 from uni4d_fg.config.models import Config
-from uni4d_fg.errors import ConfigError, InputError
+from uni4d_fg.errors import ConfigError
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 from uni4d_fg.optim.added_factors import FactorSource, checked_sources
 from uni4d_fg.optim.backend import choose_backend
 from uni4d_fg.optim.stage import LevenbergMarquardtRunner
-from uni4d_fg.slam.incremental.boundary import Boundary, checked_size, detached
+from uni4d_fg.slam.incremental.boundary import Boundary, checked_intrinsics, checked_size, detached
 from uni4d_fg.slam.incremental.dynamic import DynamicWindow, in_world, moving_scales
 from uni4d_fg.slam.incremental.labels import LabelledFrame, TrackBook
 from uni4d_fg.slam.incremental.model import (
@@ -94,7 +94,7 @@ class IncrementalReconstructor:
 
     Raises:
         ConfigError: If there is no such configuration, or it asks for what cannot be done in a window.
-        InputError: If the intrinsics are not usable.
+        InputError: If the intrinsics are not usable: a focal length not positive, the principal point outside.
         SolverError: If the additions are no list of functions.
     """
 
@@ -109,13 +109,11 @@ class IncrementalReconstructor:
     ):
         config = opened_config(config)
         check_incremental(config)
-        intrinsics = np.array(intrinsics, dtype=np.float64)
-        if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
-            raise InputError(f"intrinsics must be fx, fy, cx, cy in px with positive focal lengths, got {intrinsics}")
         if not lens.is_pinhole:
             held = config.input.model_copy(update={"intrinsics": "fixed"})
             config = config.model_copy(update={"input": held})
         self.config, self.lens, self.image_size = config, lens, checked_size(image_size)
+        intrinsics = checked_intrinsics(intrinsics, self.image_size)
         ba = config.bundle_adjustment
         noise = StaticNoise(ba.reprojection_sigma_px, ba.depth_sigma, ba.depth_correlation)
         self.window = CameraWindow(config, intrinsics, intrinsics.copy(), noise, sources=checked_sources(additions))
@@ -127,7 +125,7 @@ class IncrementalReconstructor:
         self.num_frames = 0
         self.last_timestamp = -np.inf
         self.last_pose = np.eye(4)
-        self._boundary = Boundary(self.image_size)
+        self._boundary = Boundary(self.image_size, config.input)
         self._run = LevenbergMarquardtRunner(choose_backend(config.backend))
         self.smoother = make_smoother(config.incremental, self._run)
         self._seconds: dict[str, float] = {}
@@ -149,15 +147,16 @@ class IncrementalReconstructor:
 
         Args:
             image: (H, W, 3) uint8 RGB, or (H, W) gray.
-            depth: (H, W) meters, NaN, 0 or negative where missing.
+            depth: (H, W) floats, meters, NaN, 0 or negative where missing. Frames may lack it.
             mask: (H, W) 0 static, > 0 instance that may move; all static when None.
             tracks: Points tracked to this frame; None tracks online.
             timestamp: Seconds, increasing; the number of the frame when None. A frame at the time of the last one,
                 or before it, changes nothing and is reported as such.
 
         Raises:
-            InputError: If an array has a wrong shape or type, the timestamp is not finite, or tracks are given for some
-                frames only.
+            InputError: If an array has a wrong shape or type, the timestamp is not finite, tracks are given for some
+                frames only, or there is depth for the first time, and all of it is negative or outside
+                ``input.min_depth_m`` to ``input.max_depth_m``.
             SolverError: If the window cannot be solved, a frame before could not be, or the stream was finished.
         """
         frame = self._boundary.check(self.num_frames, image, depth, mask, tracks, timestamp)
@@ -214,8 +213,9 @@ class IncrementalReconstructor:
         """Hand over what is left in the window and collect the result; more frames may not be added.
 
         Raises:
-            DegenerateProblemError: If no frame was added.
+            DegenerateProblemError: If no frame was added, or none had depth.
         """
+        self._boundary.check_finish(self.num_frames)
         self.flush()
         return self.collect(self.results)
 
