@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from uni4d_fg.cli import main
 from uni4d_fg.cli.runs import stored_input
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN
+from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.read import read_sequence
 from uni4d_fg.frontend.sequence.write import write_native
@@ -150,6 +152,21 @@ def test_the_cues_of_a_run_are_opened_again(cli: Run, frames_only: Path, clip: P
     kept = {p: p.stat().st_mtime_ns for p in before if p.exists() and "initial" not in p.name}
     assert kept == {p: t for p, t in before.items() if "initial" not in p.name}
     assert cli("reconstruct", clip, "--out", frames_only, *QUICK)[0] == 6
+
+
+def test_ctrl_c_while_cues_are_made_names_a_folder_that_exists(
+    cli: Run, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise Cancelled("structure from motion stopped")
+
+    monkeypatch.setattr("uni4d_fg.cues.gather.gather_cues", stopped)
+    code, _, err = cli("reconstruct", clip, "--out", tmp_path / "run", *QUICK)
+    assert code == 130
+    found = re.search(r"what is done is in (\S+); continue with: ", err)
+    assert found is not None
+    assert Path(found.group(1)) == tmp_path / "run"
+    assert (tmp_path / "run").is_dir()
 
 
 def test_cues_up_to_scale_are_up_to_scale_in_another_run(cli: Run, clip: Path, tmp_path: Path) -> None:

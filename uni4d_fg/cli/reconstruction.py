@@ -224,7 +224,7 @@ def run_cues(
             )
             return sequence, replace(report, seconds=time.perf_counter() - began)
         except Cancelled as error:
-            raise Cancelled(f"{error}; what is done is in {folder}; continue with: {resume_command()}") from error
+            raise Cancelled(f"{error}; what is done is in {run}; continue with: {resume_command()}") from error
 
 
 def class_list(classes: str | None) -> tuple[str, ...] | None:
