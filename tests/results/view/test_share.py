@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import time
 from pathlib import Path
@@ -30,9 +31,18 @@ def test_the_page_keeps_its_size_and_leaves_out_points(finished_run: Path, tmp_p
         assert page.frames == NUM_FRAMES
     assert 0 < small.static_points <= whole.static_points
     assert small.static_points + small.moving_points <= whole.static_points + whole.moving_points
-    with pytest.raises(ConfigError, match="max-mb"):
+    with pytest.raises(ConfigError, match="max-mb") as refused:
         write_page(run, tmp_path / "none.html", 0.5)
     assert not (tmp_path / "none.html").exists()
+    said = re.search(r"the page without any points takes (\S+) MB", str(refused.value))
+    assert said is not None
+    least = float(said.group(1))
+    assert least < whole.megabytes < 2.0
+    for limit in (least + 0.02, 0.5 * (least + whole.megabytes), 1.01 * whole.megabytes):
+        page = write_page(run, tmp_path / "fits.html", limit)
+        assert page.path.stat().st_size <= limit * MB
+        assert page.landmarks == 0
+    assert page.static_points + page.moving_points == whole.static_points + whole.moving_points
 
 
 def test_landmarks_that_stand_in_for_clouds_are_counted(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
@@ -26,8 +27,6 @@ from uni4d_fg.results.view.static_layer import StaticLayer
 from uni4d_fg.results.view.viewer import CAMERA_SIZE
 
 MB = 1_000_000
-SMALLEST_MB = 2.0
-"""viser's client alone takes 0.9 MB."""
 _BYTES_PER_POINT = 10.0
 """Of a point in the page: about 7.3 compressed, as text a third more. The start of the search for what fits."""
 _STATIC_PART = 0.6
@@ -70,18 +69,17 @@ def write_page(
         reporter: Told about progress.
 
     Raises:
-        ConfigError: If the size is too small for any page.
-        OutputError: If the file cannot be written, or the run does not fit with no points at all.
+        ConfigError: If the size is too small for the page with no points at all.
+        OutputError: If the file cannot be written, or no number of points was found that fits.
         MissingDependencyError: If viser is not installed.
     """
-    if max_mb < SMALLEST_MB:
-        raise ConfigError(f"--max-mb {max_mb:g}: the page without any points takes nearly {SMALLEST_MB:g} MB")
     reporter = reporter or SilentReporter()
     rate = frames_per_second or _rate(run)
     reporter.begin("clouds", None)
     source = _Source.of(run)
     reporter.end(f"{len(source.static.points)} static and {source.num_moving} moving points")
     total = max(int(_AIM * max_mb * MB / _BYTES_PER_POINT), 1)
+    fixed = 0.0  # bytes of the page without any points; measured only once points are to be left out
     reporter.begin("page", _ATTEMPTS)
     for attempt in range(_ATTEMPTS):
         static, moving = source.within(total)
@@ -97,7 +95,12 @@ def write_page(
             moving_points = points - len(static.points)
             landmarks = len(_landmark_rows(run, static))
             return SharedPage(path, len(data) / MB, len(static.points), moving_points, len(moving), landmarks)
-        total = int(_AIM * max_mb * MB / len(data) * points)
+        if len(data) > max_mb * MB and not fixed:
+            fixed = _fixed_size(run, source, rate)
+            if fixed > max_mb * MB:
+                least = math.ceil(100 * fixed / MB) / 100
+                raise ConfigError(f"--max-mb {max_mb:g}: the page without any points takes {least:g} MB")
+        total = max(int((_AIM * max_mb * MB - fixed) / max(len(data) - fixed, 1.0) * points), 1)
     raise OutputError(f"{path}: the run does not fit into {max_mb:g} MB; give a larger --max-mb")
 
 
@@ -123,8 +126,8 @@ class _Source:
 
     def within(self, total: int) -> tuple[ColoredPoints, list[ColoredPoints]]:
         """Thin the clouds to so many points together; what one does not need goes to the other."""
-        for_static = max(int(_STATIC_PART * total), total - self.num_moving)
-        static = self.static.thinned(for_static) if for_static else NOTHING
+        # Without any static point landmarks would stand in for them.
+        static = self.static.thinned(max(int(_STATIC_PART * total), total - self.num_moving, 1))
         left = (total - len(static.points)) / max(self.num_moving, 1)
         return static, [cloud.thinned(int(left * len(cloud.points))) for cloud in self.moving]
 
@@ -147,6 +150,11 @@ def _page(run: Run, static: ColoredPoints, moving: list[ColoredPoints], rate: fl
         serializer = _recorded(server, run, static, moving, rate)
         page: str = serializer.as_html(dark_mode=True)
     return with_scripts(page.replace(_TITLE, f"<title>{escape(run.name)}</title>", 1))
+
+
+def _fixed_size(run: Run, source: _Source, rate: float) -> int:
+    """Return the bytes of the page of as good as no points."""
+    return len(_page(run, source.static.thinned(1), [NOTHING for _ in source.moving], rate).encode("utf-8"))
 
 
 def _recorded(server: Any, run: Run, static: ColoredPoints, moving: list[ColoredPoints], rate: float) -> Any:
