@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import signal
 import subprocess
@@ -88,6 +89,11 @@ def assert_same(folder: Path, expected: Path) -> None:
     assert not list(folder.rglob(".tmp-*"))
 
 
+def stream_stage(folder: Path) -> dict[str, Any]:
+    """What the summary of a run says of the stream."""
+    return dict(json.loads((folder / "summary.json").read_text())["stages"]["stream"])
+
+
 def assert_in_order(trajectory: Path) -> None:
     """Assert that a trajectory that is still being written has every frame once."""
     lines = trajectory.read_text().splitlines() if trajectory.exists() else []
@@ -100,9 +106,16 @@ def test_an_interrupted_stream_goes_on_where_it_was(tmp_path: Path, undisturbed:
     polls = iter(range(FRAMES + 1))
     with pytest.raises(Cancelled, match=f"before frame {stop_before}"):
         stream_sequence(stream(FRAMES), tmp_path, CONFIG, should_stop=lambda: next(polls) == stop_before)
+    with np.load(tmp_path / "stages" / "stream.npz") as stored:
+        seconds = dict(zip(stored["seconds_part"].tolist(), stored["seconds"].tolist(), strict=True))
     summary = stream_sequence(stream(FRAMES), tmp_path, CONFIG, resume=True)
     assert summary.resumed_from == stop_before
     assert_same(tmp_path, undisturbed)
+    assert summary.counts == stream_stage(undisturbed)["counts"]
+    assert "total" in seconds
+    assert all(summary.seconds[part] >= value for part, value in seconds.items())
+    assert summary.seconds["total"] > seconds["total"]
+    assert stream_stage(tmp_path)["seconds"] == summary.seconds
 
 
 @pytest.mark.parametrize("refine", ["on", "off"])
@@ -177,6 +190,12 @@ def test_the_verb(tmp_path: Path) -> None:
     result = CliRunner().invoke(application(), words)
     assert result.exit_code == 0, result.output
     assert "10 frames" in result.output
+    whole = stream_stage(run)["counts"]
+    assert sum(whole.values()) == 10
+    resumed = CliRunner().invoke(application(), [*words, "--resume"])
+    assert resumed.exit_code == 0, resumed.output
+    assert f"10 frames ({', '.join(f'{count} {status}' for status, count in whole.items())})" in resumed.output
+    assert stream_stage(run)["counts"] == whole
     assert "frames a second" in result.output
     assert load_reconstruction(run / "reconstruction.npz").num_frames == 10
     assert CliRunner().invoke(application(), words).exit_code != 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -48,18 +49,21 @@ class StreamSummary:
     num_frames: int
     resumed_from: int
     counts: dict[str, int]
-    """Frames of this process per status."""
+    """Frames per status, those of earlier processes too."""
     seconds: dict[str, float]
-    """Of this process, per part and in all."""
+    """Per part and in all, those of earlier processes up to the checkpoint too."""
     peak_memory_mb: float
     doubts: list[str] = field(default_factory=list)
     """What to distrust in the result, one sentence each."""
-    bridged: int = 0
-    """Frames of the result that were bridged, those of earlier processes too."""
     facts: list[str] = field(default_factory=list)
     """Loops that were closed, and what measurements there were."""
     metric: bool = True
     """Whether lengths are in meters."""
+
+    @property
+    def bridged(self) -> int:
+        """Frames that were bridged."""
+        return self.counts.get(FrameStatus.BRIDGED.value, 0)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -69,6 +73,7 @@ class StreamSummary:
             "stages": {
                 "stream": {
                     **{k: v for k, v in self.__dict__.items() if k not in ("doubts", "metric")},
+                    "bridged": self.bridged,
                     "name": "stream",
                 }
             },
@@ -189,40 +194,44 @@ def _stream(
     folder, key = StreamFolder(run_dir), StreamKey(sequence, config, sources)
     solver = IncrementalReconstructor(sequence.intrinsics, sequence.image_size, config, folder, sources, sequence.lens)
     # What is there is touched only when it is known that this goes on from it, or replaces it.
-    resumed = folder.resume(solver, key, should_stop) if resume else False
+    before = folder.resume(solver, key, should_stop) if resume else None
     remove_leftovers(RunFolder(run_dir))
-    if not resumed:
+    if before is None:
         remove_file(RunFolder(run_dir).trajectory)
         remove_file(folder.checkpoint)
     atomic_write_text(RunFolder(run_dir).config, dump_config(config))
     first, began = solver.num_frames, time.perf_counter()
-    counts: dict[str, int] = {}
-    seconds: dict[str, float] = {}
+    seconds = before or {}
+    earlier = seconds.get("total", 0.0)
+
+    def save() -> None:
+        seconds["total"] = earlier + time.perf_counter() - began
+        folder.save(solver, key, seconds)
+
     for frame in range(first, sequence.num_frames):
         if should_stop is not None and should_stop():
-            folder.save(solver, key)
+            save()
             raise Cancelled(f"stopped before frame {frame}; --resume goes on from there")
         image, depth, mask = sequence.images[frame], sequence.depths[frame], sequence.masks[frame]
         # Some frame has usable depth, as was checked: one that is too far at the start is a frame that lacks it.
         usable = np.where(usable_depth(depth, config.input), depth, np.nan)
         update = solver.add_frame(image, usable, mask, _tracks(sequence, frame), float(sequence.timestamps[frame]))
         key.take(image, depth, mask)
-        counts[update.status.value] = counts.get(update.status.value, 0) + 1
         for part, value in update.seconds.items():
             seconds[part] = seconds.get(part, 0.0) + value
         if on_frame is not None:
             on_frame(update)
         if (frame + 1) % config.incremental.checkpoint_interval == 0:
             since = time.perf_counter()
-            folder.save(solver, key)
+            save()
             seconds["checkpoint"] = seconds.get("checkpoint", 0.0) + time.perf_counter() - since
-    folder.save(solver, key)
+    save()
     solver.flush()
     finished = folder.read()
     path, closing = close_stream(finished, solver.intrinsics, sequence, config)
     reconstruction = solver.collect(path)
     write_result(RunFolder(run_dir), reconstruction)
-    seconds["total"] = time.perf_counter() - began
+    seconds["total"] = earlier + time.perf_counter() - began
     doubts = scene_warnings(
         sequence.given_intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
         intrinsics_covariance=reconstruction.intrinsics_covariance,
@@ -234,11 +243,8 @@ def _stream(
     if closing is not None:
         seconds["loops"], facts = closing.seconds, [*facts, *closing.facts()]
         doubts += closing.warnings()
-    bridged = sum(frame.status is FrameStatus.BRIDGED for frame in finished.frames())
-    summary = StreamSummary(
-        sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), doubts, bridged, facts
-    )
-    return summary
+    counts = dict(Counter(frame.status.value for frame in finished.frames()))
+    return StreamSummary(sequence.name, sequence.num_frames, first, counts, seconds, peak_memory_mb(), doubts, facts)
 
 
 def _tracks(sequence: Sequence, frame: int) -> FrameTracks | None:

@@ -7,6 +7,7 @@ anew from the stored keyframes, and the numbers agree within the solver's tolera
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -146,6 +147,24 @@ def _restore(solver: IncrementalReconstructor, arrays: Arrays) -> None:
     ]  # fmt: skip
     solver.num_frames, solver.last_timestamp = int(arrays["num_frames"]), float(arrays["last_timestamp"])
     solver.last_pose = arrays["last_pose"]
+
+
+def seconds_arrays(seconds: Mapping[str, float]) -> Arrays:
+    """Return the seconds that went into a stream, by part, as arrays."""
+    return {"seconds_part": np.array(list(seconds), dtype=np.str_), "seconds": np.array(list(seconds.values()), float)}
+
+
+def take_seconds(arrays: Arrays) -> dict[str, float]:
+    """Take what :func:`seconds_arrays` was given out of a checkpoint; nothing where it was not written.
+
+    Raises:
+        InputError: If an array is malformed.
+    """
+    names, values = arrays.pop("seconds_part", np.zeros(0)), arrays.pop("seconds", np.zeros(0))
+    try:
+        return {str(name): float(value) for name, value in zip(names.tolist(), values.tolist(), strict=True)}
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the stored state is damaged ({error!r}); start again with --overwrite") from error
 
 
 def result_arrays(frames: list[FinishedFrame], landmarks: list[Landmarks]) -> Arrays:

@@ -7,7 +7,7 @@ trajectory is appended line by line as frames leave the window, for whoever watc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,14 @@ from uni4d_fg.files import load_npz, remove_file, save_npz, write_failure
 from uni4d_fg.frontend.trajectory_files import write_tum
 from uni4d_fg.geometry.se3 import orthonormalize
 from uni4d_fg.geometry.trajectory import Trajectory
-from uni4d_fg.pipeline.stream_checkpoint import restore, result_arrays, results_of, state_arrays
+from uni4d_fg.pipeline.stream_checkpoint import (
+    restore,
+    result_arrays,
+    results_of,
+    seconds_arrays,
+    state_arrays,
+    take_seconds,
+)
 from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.reading import is_present
 from uni4d_fg.results.run_folder import RunFolder
@@ -59,8 +66,13 @@ class StreamFolder:
         if frames:
             self._append(frames)
 
-    def save(self, solver: IncrementalReconstructor, key: StreamKey) -> None:
+    def save(self, solver: IncrementalReconstructor, key: StreamKey, seconds: Mapping[str, float]) -> None:
         """Write a part and the checkpoint.
+
+        Args:
+            solver: Its state.
+            key: What the checkpoint belongs to.
+            seconds: Of the stream so far, by part.
 
         Raises:
             OutputError: If one of them cannot be written.
@@ -68,13 +80,13 @@ class StreamFolder:
         self._write_part()
         save_npz(
             self.checkpoint, key=np.array(key.selection), consumed=np.array(key.consumed),
-            num_parts=np.array(self.num_parts), **state_arrays(solver),
+            num_parts=np.array(self.num_parts), **seconds_arrays(seconds), **state_arrays(solver),
         )  # fmt: skip
 
     def resume(
         self, solver: IncrementalReconstructor, key: StreamKey, should_stop: Callable[[], bool] | None = None
-    ) -> bool:
-        """Bring a new solver to the last checkpoint; False if there is none.
+    ) -> dict[str, float] | None:
+        """Bring a new solver to the last checkpoint; return the seconds up to there, by part, or None if there is none.
 
         Raises:
             InputError: If the checkpoint is damaged, or of another configuration, selection or sequence.
@@ -82,7 +94,7 @@ class StreamFolder:
             Cancelled: If ``should_stop`` turned true.
         """
         if not is_present(self.checkpoint):
-            return False
+            return None
         arrays = load_npz(self.checkpoint, {"key": None, "consumed": None, "num_parts": 0, "num_frames": 0})
         try:
             selection, consumed = str(arrays.pop("key")), str(arrays.pop("consumed"))
@@ -90,9 +102,10 @@ class StreamFolder:
         except InputError as error:
             raise InputError(f"{self.checkpoint}: {error}") from error
         self.num_parts = int(arrays.pop("num_parts"))
+        seconds = take_seconds(arrays)
         restore(solver, arrays)
         self._rewrite_trajectory()
-        return True
+        return seconds
 
     def frames(self) -> list[FinishedFrame]:
         """Read all finished frames in order."""
