@@ -117,11 +117,27 @@ def one_image(folder: Path) -> Path:
     return folder / "a.png"
 
 
+def other_images(folder: Path) -> Path:
+    for name in ("0.tif", "1.TIF", "2.webp", "notes.txt"):
+        (folder / name).write_bytes(b"x")
+    return folder
+
+
+def animation(folder: Path) -> Path:
+    (folder / "clip.gif").write_bytes(b"GIF89a")
+    return folder / "clip.gif"
+
+
 WRONG = {
     "absent": (lambda root: root / "absent", "no such folder or file"),
     "one image": (one_image, "is one image"),
     "one frame": (lambda root: write_video(root / "clip.mp4", gray_frames(1)), r"has 1 frame\(s\); give at least 2"),
     "empty folder": (lambda root: root, "there is no rgb/ and no video, nor are there images"),
+    "other images": (
+        other_images,
+        r"nor are there images that are read \(\.png, \.jpg, \.jpeg\): it holds \.tif, \.webp; convert them to \.png",
+    ),
+    "animation": (animation, r"is a \.gif image, which is not read; convert it to a video such as clip\.mp4"),
     "one image in a folder": (lambda root: one_image(root).parent, r"has 1 frame\(s\)"),
     "phone pictures": (
         lambda root: [(root / "rgb").mkdir(), (root / "rgb" / "IMG_1.HEIC").write_bytes(b"x")] and root,

@@ -15,6 +15,8 @@ LayoutName = Literal["native", "uni4d"]
 Layout = Literal["auto", "native", "uni4d"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+OTHER_IMAGE_SUFFIXES = (".tif", ".tiff", ".bmp", ".webp", ".gif", ".heic", ".heif", ".avif", ".ppm", ".pgm", ".exr")
+"""Images that are not read, and are named as such."""
 DEPTH_SUFFIXES = (".png", ".npy")
 MASK_SUFFIXES = (".png", ".npy")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
@@ -106,6 +108,12 @@ def is_visible_file(path: Path) -> bool:
     Whether it can be read as a file is found out when it is: a pipe, or a link to nothing, is not passed over.
     """
     return not path.name.startswith(".") and not path.is_dir()
+
+
+def not_read_images(root: Path) -> list[str]:
+    """Return the endings of the images in a folder that are not read, sorted; empty if there are none."""
+    found = {p.suffix.lower() for p in list_folder(root) if is_visible_file(p)}
+    return sorted(found & set(OTHER_IMAGE_SUFFIXES))
 
 
 def missing_images(root: Path) -> SequenceProblem:

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 from uni4d_fg.frontend.sequence.assemble import assemble
 from uni4d_fg.frontend.sequence.layout import (
     IMAGE_SUFFIXES,
+    OTHER_IMAGE_SUFFIXES,
     Layout,
     LayoutName,
     LayoutOptions,
     SequenceFiles,
     check_root,
     find_images,
+    not_read_images,
 )
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.native import find_native_files, is_native_layout
@@ -47,11 +49,13 @@ def detect_layout(root: Path, depth: str | None = None) -> LayoutName:
         return "uni4d"
     if native or find_images(root) is not None:
         return "native"
-    raise SequenceProblem(
-        root,
-        "is not a sequence folder: there is no rgb/ and no video, nor are there images",
-        "put frames into rgb/ and depth into depth_cue/ (native) or unidepth/depth.npy (Uni4D)",
-    )
+    what = "is not a sequence folder: there is no rgb/ and no video, nor are there images"
+    remedy = "put frames into rgb/ and depth into depth_cue/ (native) or unidepth/depth.npy (Uni4D)"
+    others = not_read_images(root)
+    if others:
+        what += f" that are read ({', '.join(IMAGE_SUFFIXES)}): it holds {', '.join(others)}"
+        remedy = "convert them to .png or .jpg"
+    raise SequenceProblem(root, what, remedy)
 
 
 def find_files(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOptions]) -> SequenceFiles:
@@ -90,6 +94,11 @@ def find_files(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOpti
 def _video_file(path: Path, options: LayoutOptions) -> SequenceFiles:
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise SequenceProblem(path, "is one image", "give a folder of images, or a video file")
+    if path.suffix.lower() in OTHER_IMAGE_SUFFIXES:
+        raise SequenceProblem(
+            path, f"is a {path.suffix.lower()} image, which is not read",
+            f"convert it to a video such as {path.stem}.mp4, or its frames to .png or .jpg in a folder",
+        )  # fmt: skip
     named = [name for name in ("depth", "masks", "tracks") if options.get(name) is not None]
     if named:
         raise SequenceProblem(
