@@ -42,6 +42,19 @@ def test_colmap(tmp_path: Path, line: str, intrinsics: np.ndarray, lens: Lens) -
     assert found.lens == lens
 
 
+@pytest.mark.parametrize("delimiter", [" ", ","])
+def test_a_matrix_as_text_is_the_matrix(tmp_path: Path, delimiter: str) -> None:
+    matrix = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
+    path = tmp_path / "K.txt"
+    np.savetxt(path, matrix, delimiter=delimiter, header="K")
+    found = load_calibration(path, 5, SIZE)
+    np.testing.assert_array_equal(found.intrinsics, K)
+    assert found.lens == PINHOLE
+    np.savetxt(path, matrix.T)
+    with pytest.raises(InputError, match=r"K\.txt: is not a pinhole matrix"):
+        load_calibration(path, 5, SIZE)
+
+
 def test_a_calibration_follows_the_size_of_the_video(tmp_path: Path) -> None:
     path = written(tmp_path / "cameras.txt", "1 OPENCV 1280 960 1000 1020 640 480 -0.25 0.06 0.003 -0.002\n")
     found = load_calibration(path, 5, SIZE)

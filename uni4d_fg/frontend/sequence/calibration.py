@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.files import load_npy
@@ -42,10 +44,16 @@ def check_zoom(zoom: FloatArray | None, num_frames: int, where: Path | str) -> N
 
 
 def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> FloatArray:
-    """Read the shared intrinsics of a video.
+    """Read the shared intrinsics of a video from a ``.npy`` file, see :func:`shared_intrinsics`. Raises the same."""
+    return shared_intrinsics(load_npy(path, memory_map=True), path, num_frames, size)
+
+
+def shared_intrinsics(values: npt.NDArray[Any], path: Path, num_frames: int, size: tuple[int, int]) -> FloatArray:
+    """Return the shared intrinsics of a video.
 
     Args:
-        path: ``.npy`` file of one (3, 3) matrix, of (T, 3, 3), whose mean is taken, or of (4,) fx, fy, cx, cy, px.
+        values: One (3, 3) matrix, (T, 3, 3), whose mean is taken, or (4,) fx, fy, cx, cy, px.
+        path: The file they are from.
         num_frames: T.
         size: (height, width), px.
 
@@ -54,9 +62,8 @@ def load_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> Float
 
     Raises:
         VaryingIntrinsics: If the frames' matrices differ by more than 1 %.
-        InputError: If the file cannot be read or does not hold pinhole matrices without skew.
+        InputError: If they are not pinhole matrices without skew.
     """
-    values = load_npy(path, memory_map=True)
     if values.shape == (4,):
         values = intrinsics_matrix(values)
     if values.ndim not in (2, 3) or values.shape[-2:] != (3, 3) or values.size == 0:

@@ -3,6 +3,7 @@
 | file | what it holds | pixel centers |
 |---|---|---|
 | ``.npy`` | a (3, 3) matrix, or one per frame | integers |
+| ``.txt`` | a (3, 3) matrix, as ``numpy.savetxt`` writes it | integers |
 | ``.txt`` | COLMAP's ``cameras.txt`` with one camera | 0.5 |
 | ``.json`` | nerfstudio's ``transforms.json`` | 0.5 |
 | ``.yaml``, ``.yml`` | OpenCV's ``FileStorage``, ROS's ``camera_info``, Kalibr's ``camchain`` | integers |
@@ -26,7 +27,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.yaml_text import parse_yaml
 from uni4d_fg.errors import ConfigError, InputError
-from uni4d_fg.frontend.sequence.calibration import load_intrinsics
+from uni4d_fg.frontend.sequence.calibration import load_intrinsics, shared_intrinsics
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.resize import scale_intrinsics
 from uni4d_fg.geometry.lens import PINHOLE, Lens, LensModel
@@ -74,6 +75,9 @@ def load_calibration(path: Path, num_frames: int, size: tuple[int, int]) -> Cali
         return Calibration(load_intrinsics(path, num_frames, size))
     if suffix not in (".txt", ".json", ".yaml", ".yml"):
         raise SequenceProblem(path, "is no calibration that is known", "give .npy, .txt, .json, .yaml or .yml")
+    matrix = _matrix(path) if suffix == ".txt" else None
+    if matrix is not None:
+        return Calibration(shared_intrinsics(matrix, path, num_frames, size))
     read = {".txt": _colmap, ".json": _nerfstudio}.get(suffix, _yaml)
     try:
         found = read(path)
@@ -103,8 +107,24 @@ def _fitted(path: Path, found: Calibration, size: tuple[int, int]) -> Calibratio
     return Calibration(scale_intrinsics(found.intrinsics, found.size, size), found.lens, size)
 
 
+def _matrix(path: Path) -> FloatArray | None:
+    """Return the matrix (3, 3) of a text file of three lines with three numbers each; None for another file."""
+    lines = [line.replace(",", " ").split() for line in _lines(path)]
+    if [len(line) for line in lines] != [3, 3, 3]:
+        return None
+    try:
+        return np.array(lines, dtype=np.float64)
+    except ValueError:
+        return None
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a text file that are neither empty nor comments."""
+    return [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+
+
 def _colmap(path: Path) -> Calibration:
-    lines = [line.split() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line.split() for line in _lines(path)]
     if len(lines) != 1:
         raise SequenceProblem(path, f"has {len(lines)} cameras", "give a cameras.txt with the one camera of the video")
     _, model, width, height, *numbers = lines[0]
