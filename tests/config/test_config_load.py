@@ -216,6 +216,14 @@ def test_scenes_take_overrides_and_report_contradictions() -> None:
         with_overrides(SyntheticSceneConfig(), ["margin_px=100", "height=64"])
 
 
+def test_limits_of_depth_leave_some() -> None:
+    assert load_config("default", ["input.min_depth_m=90", "input.max_depth_m=200"]).input.min_depth_m == 90
+    for value in (80, 90):
+        message = rf"input: min_depth_m \({value}\) must be below max_depth_m \(80\): all depth would be missing"
+        with pytest.raises(ConfigError, match=message):
+            load_config("default", [f"input.min_depth_m={value}"])
+
+
 def test_every_field_says_what_it_means_and_takes() -> None:
     for field in describe_fields(Config()):
         assert field.description, field.path

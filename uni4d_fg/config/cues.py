@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pydantic import model_validator
+
 from uni4d_fg.config.base import Section, setting
 
 
@@ -123,3 +125,12 @@ class InputConfig(Section):
     )
     min_depth_m: float = setting(0.05, "Depth below this is treated as missing, m.", ge=0, basic=True)
     max_depth_m: float = setting(80.0, "Depth above this is treated as missing, m.", gt=0, basic=True)
+
+    @model_validator(mode="after")
+    def _some_depth_is_usable(self) -> InputConfig:
+        if self.min_depth_m >= self.max_depth_m:
+            raise ValueError(
+                f"min_depth_m ({self.min_depth_m:g}) must be below max_depth_m ({self.max_depth_m:g}): all depth would "
+                "be missing"
+            )
+        return self
