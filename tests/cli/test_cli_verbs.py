@@ -306,6 +306,19 @@ def test_evaluate_finds_the_sequence_of_the_run(cli: Run, finished: Path, scene:
     assert report["trajectory"]["ate_m"] < 0.1
 
 
+def test_evaluate_of_a_sequence_that_was_moved_says_how_to_give_it(
+    cli: Run, finished: Path, scene: Path, tmp_path: Path
+) -> None:
+    for name in ("reconstruction.npz", "labels.npz", "summary.json"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    (tmp_path / "input.json").write_text(json.dumps({"root": str(tmp_path / "gone")}))
+    code, _, err = cli("evaluate", tmp_path)
+    assert code == 3
+    assert f"{tmp_path / 'gone'}: no such folder or file" in err
+    assert "if it was moved, give its folder with --sequence" in err
+    assert cli("evaluate", tmp_path, "--sequence", scene)[0] == 0
+
+
 def test_evaluate_takes_the_frames_of_a_sequence_that_the_run_was_made_from(
     cli: Run, scene: Path, tmp_path: Path
 ) -> None:

@@ -11,7 +11,7 @@ import typer
 from uni4d_fg.cli import options
 from uni4d_fg.cli.console import print_json
 from uni4d_fg.cli.options import LayoutChoice
-from uni4d_fg.cli.runs import SequenceInput, stored_input
+from uni4d_fg.cli.runs import SequenceInput, read_stored, stored_input
 from uni4d_fg.frontend.sequence.model import Sequence
 
 
@@ -35,7 +35,7 @@ def evaluate(
     for folder in finished_shots(run) if is_split(run) else [run]:
         stored = stored_input(folder)
         if sequence is None:
-            truth = stored.read()
+            truth = read_stored(stored, folder)
         elif sequence.is_file():  # the run's own video, elsewhere: its cues are in the run
             truth = stored.moved_to(sequence).read()
         else:

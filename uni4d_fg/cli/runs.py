@@ -20,6 +20,7 @@ from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.sequence.read import detect_layout, read_sequence
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
 from uni4d_fg.reading import expanded, is_present, read_text, resolved
+from uni4d_fg.results.run import IF_MOVED
 from uni4d_fg.results.run_contents import COMMAND_LINE, STORED_INPUT, claim_folder
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.results.summary_file import read_summary
@@ -273,6 +274,20 @@ def _check_same_video(folder: Path, source: SequenceInput, whole: bool) -> None:
             f"{folder}: holds a run of {was}; continue it with the same, replace it with --overwrite, or choose "
             "another --out"
         )
+
+
+def read_stored(stored: SequenceInput, run: Path) -> Sequence:
+    """Read the sequence that a run was made from, see :meth:`SequenceInput.read`; one that is gone may have been moved.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    try:
+        return stored.read()
+    except InputError as error:
+        if _is_there(stored.root):
+            raise
+        raise InputError(f"{run}: its sequence is needed ({error}); {IF_MOVED}") from error
 
 
 def stored_input(folder: Path) -> SequenceInput:

@@ -36,6 +36,8 @@ ValueT = TypeVar("ValueT")
 SequenceReader: TypeAlias = Callable[[], "Sequence | Video"]
 
 _PARTS = {"labelled": "tracks are not shown", "depth": "fused depth is not shown", "sequence": "images are not shown"}
+IF_MOVED = "if it was moved, give its folder with --sequence"
+"""What to do about a sequence that is not where it was."""
 _OPTIONAL_PARTS = ("confidence",)
 """Nobody misses them."""
 
@@ -193,8 +195,7 @@ class Run:
         """Return the sequence with all its cues. Raises InputError if it is not at hand or does not fit the run."""
         if self._sequence.error is not None:
             raise InputError(
-                f"{self.folder.root}: the images of its sequence are needed ({self._sequence.error}); "
-                "if it was moved, give its folder with --sequence"
+                f"{self.folder.root}: the images of its sequence are needed ({self._sequence.error}); {IF_MOVED}"
             ) from self._sequence.error
         sequence = self._sequence.need()
         if not isinstance(sequence, Sequence):
