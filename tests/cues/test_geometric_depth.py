@@ -137,6 +137,8 @@ def test_camera_in_one_place_gets_a_sphere_and_a_warning(path: str) -> None:
     depth = run(simulation, np.asarray(simulation.tracks.instance == 0))
     assert not depth.has_parallax
     assert "depth cannot be seen" in depth.warnings[0]
+    assert ("the camera stands still" in depth.warnings[0]) is (path == "static")
+    assert ("rotations" in " ".join(depth.warnings)) is (path == "rotation")
     np.testing.assert_array_equal(depth.world_T_cam[:, :3, 3], 0.0)
     truth = simulation.sequence.ground_truth.world_T_cam
     assert truth is not None

@@ -92,6 +92,10 @@ def test_a_stream_warns_of_what_a_batch_run_warns_of() -> None:
     assert scene_warnings(given, given, poses, points, np.full((3, 6, 6), np.nan)) == []
     still = np.tile(np.eye(4), (3, 1, 1))
     assert "moves by only 0.00 %" in scene_warnings(given, given, still, points)[0]
+    assert "cue alone" in scene_warnings(given, given, still, points)[0]
+    for parallax, origin in ((True, "from which all depth was found"), (False, "which was assumed")):
+        (little,) = scene_warnings(given, given, still, points, depth_parallax=parallax)
+        assert f"moves by only 0.00 % of the scene's depth, {origin}" in little
 
 
 @pytest.mark.parametrize(("sigma_px", "poor"), [(0.0, False), (3.0, False), (16.0, True), (np.nan, True)])

@@ -42,6 +42,7 @@ from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
+from uni4d_fg.geometry.se3 import so3_log
 from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
@@ -362,18 +363,26 @@ def _without_parallax(
     seen = tracks.visible & is_static[:, None]
     sparse[seen] = _on_sphere(tracks.uv[seen].astype(np.float64), intrinsics, config.median_depth)
     poses = rotations_only(observations, video.num_frames, intrinsics)
+    turns_px = float(intrinsics[:2].max() * np.linalg.norm(so3_log(poses[:, :3, :3]), axis=1).max())
+    turns = turns_px > config.min_parallax_px
+    if turns:
+        seen_as = f"only rotates (a pure rotation explains the tracks to within {config.min_parallax_px:g} px)"
+        real = "rotations are real, structure and moving depth are not"
+    else:
+        seen_as = f"stands still (tracks stay where they are to within {config.min_parallax_px:g} px)"
+        real = "structure and moving depth are not real"
     warnings: tuple[str, ...] = (
-        "the camera only rotates (a pure rotation explains the tracks to within "
-        f"{config.min_parallax_px:g} px), so depth cannot be seen: everything was put at distance "
-        f"{config.median_depth:g}; rotations are real, structure and moving depth are not. Give depth maps for those",
+        f"the camera {seen_as}, so depth cannot be seen: everything was put at distance {config.median_depth:g}; "
+        f"{real}. Give depth maps for those",
     )
     facts: tuple[str, ...] = ("no parallax",)
     if found is not None:
         facts += (f"rotations tell a focal length of {found.focal:.1f} px, to {100 * found.sigma:.0f} %",)
     elif is_sought:
+        consequence = ", and rotations err as much as it does" if turns else ""
         warnings += (
-            f"the camera turns too little to tell its focal length: {intrinsics[0]:.0f} px is a guess, and rotations "
-            "err as much as it does; give K.npy",
+            f"the camera turns too little to tell its focal length: {intrinsics[0]:.0f} px is a guess{consequence}; "
+            "give K.npy",
         )
     moving = np.zeros(tracks.num_tracks, dtype=bool)
     sigma = 0.0 if found is None else found.sigma

@@ -143,7 +143,7 @@ def _unmatchable(
     if not config.multiview.enabled:
         return "is switched off"
     if depth_parallax is False:
-        return "is not made of a camera that only rotates"
+        return "is not made of a camera that stays in one place"
     if zooms_and_bends:
         return "is not made of frames that zoom through a lens that bends them"
     if size is None:
@@ -159,7 +159,7 @@ def _summary(maps: DenseMaps, told: ToldError) -> dict[str, Any]:
     error = told.mean()
     if maps.sequence.depth_parallax is False:
         out["depth_is_unknown"] = True
-        out["facts"].append("nothing is known of depth: the camera only rotates, and a distance was assumed")
+        out["facts"].append("nothing is known of depth: the camera stays in one place, and a distance was assumed")
     elif error is not None:
         out["depth_error"] = error
         out["facts"].append(f"static depth is off by some {100 * error:.1f} % (estimated, but for scale)")

@@ -215,6 +215,7 @@ def bundle_summary(
     warnings = scene_warnings(
         sequence.given_intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
         arrays["intrinsics_covariance"], focal_was_doubted=sequence.focal_sigma is not None,
+        depth_parallax=sequence.depth_parallax,
     )  # fmt: skip
     warnings += unmasked_motion_warnings(
         labelled,

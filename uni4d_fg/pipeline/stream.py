@@ -234,7 +234,7 @@ def _stream(
     seconds["total"] = earlier + time.perf_counter() - began
     doubts = scene_warnings(
         sequence.given_intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
-        intrinsics_covariance=reconstruction.intrinsics_covariance,
+        intrinsics_covariance=reconstruction.intrinsics_covariance, depth_parallax=sequence.depth_parallax,
     )  # fmt: skip
     facts = []
     if sequence.intrinsics_are_guessed:

@@ -19,6 +19,11 @@ _MAX_FOCAL_SIGMA = 0.04
 """Standard deviation, as a part of the focal length, above which it counts as poorly determined."""
 _MAX_UNCERTAINTY = 0.05
 """Root mean square of the positions' sigmas, of the path's length: a path that may be off by a twentieth of itself."""
+_DEPTH_IS_FROM = {
+    None: ": depth comes from the cue alone",
+    True: ", from which all depth was found",
+    False: ", which was assumed",
+}
 
 _MOVES_SIGMAS, _MOVES_PART = 3.0, 0.01
 """Median reprojection error of a track that does not fit a static world: as a multiple of the noise, and at least, as a
@@ -116,6 +121,7 @@ def scene_warnings(
     intrinsics_covariance: FloatArray | None = None,
     *,
     focal_was_doubted: bool = False,
+    depth_parallax: bool | None = None,
 ) -> list[str]:
     """Return one sentence for everything that makes a static scene doubtful.
 
@@ -127,6 +133,7 @@ def scene_warnings(
         pose_covariance: (T, 6, 6) of the poses' twists, translation last; NaN where it is not known.
         intrinsics_covariance: (4, 4) of ``intrinsics``, px^2; zero where they were held, NaN where it is not known.
         focal_was_doubted: How well the focal lengths are known was said where they were found.
+        depth_parallax: Whether the depth that was made from motion saw any; None for depth that was given.
     """
     warnings = focal_warnings(given_intrinsics, intrinsics[:2])
     if not len(landmarks):
@@ -136,8 +143,8 @@ def scene_warnings(
     depth = float(np.median(np.linalg.norm(landmarks - first, axis=1)))
     focal_sigma = _focal_sigma(intrinsics_covariance, intrinsics)
     if baseline < _MIN_BASELINE * depth:
-        text = f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth: "
-        text += "depth comes from the cue alone"
+        text = f"the camera moves by only {100 * baseline / depth:.2f} % of the scene's depth"
+        text += _DEPTH_IS_FROM[depth_parallax]
         # A camera that turns on the spot determines its focal length; one that is held needs no determining.
         if not focal_sigma <= _MAX_FOCAL_SIGMA:
             text += ", and the focal length is poorly determined"

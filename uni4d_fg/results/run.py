@@ -125,7 +125,7 @@ class Run:
 
     @property
     def depth_is_unknown(self) -> bool:
-        """Whether everything was put at an assumed distance, because the camera only rotates and no depth was given."""
+        """Whether everything was put at an assumed distance: the camera stays in one place, and no depth was given."""
         fusion = self.summary.get("stages", {}).get("fusion")
         return isinstance(fusion, dict) and fusion.get("depth_is_unknown") is True
 

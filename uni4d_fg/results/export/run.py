@@ -82,7 +82,7 @@ def _export(
         straight = not run.reconstruction.lens.is_pinhole and (options.undistort or not chosen.has_lens)
         job = ExportJob(undistorted(run) if straight else run, folder, options, reporter, should_stop)
         if run.depth_is_unknown:
-            job.warnings.append("the camera only rotates: positions, points and depth are at an assumed distance")
+            job.warnings.append("the camera stays in one place: positions, points and depth are at an assumed distance")
         if straight:
             job.facts.append(f"undistorted: {run.reconstruction.lens.model} to PINHOLE")
         chosen.write(job)

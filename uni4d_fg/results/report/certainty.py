@@ -28,8 +28,8 @@ def certainty(run: Run) -> Markup:
 def _scale(run: Run) -> Iterator[str]:
     if run.depth_is_unknown:
         yield (
-            "Nothing is known of depth: the camera only rotates, and everything was put at one distance. Rotations are "
-            "real; positions, points and clouds are not."
+            "Nothing is known of depth: the camera stays in one place, and everything was put at one distance. "
+            "Rotations are real; positions, points and clouds are not."
         )
     elif run.is_metric:
         yield (
