@@ -17,6 +17,8 @@ _DISTINCT = 0.8
 """A feature is matched whose best match is nearer than this part of the distance of the second."""
 _ERROR_PX = 3.0
 _SCALES = (0.5, 2.0)
+_MOST_ROLL = np.radians(45.0)
+"""Shots of one place that is seen upside down are two."""
 _LEAST = 12
 """Features that must agree."""
 
@@ -43,6 +45,8 @@ def show_one_place(one: ImageArray, other: ImageArray, longer_side: int) -> bool
     target = there[[pair.trainIdx for pair in pairs]]
     moved, agrees = cv2.estimateAffinePartial2D(source, target, method=cv2.RANSAC, ransacReprojThreshold=_ERROR_PX)
     if moved is None or not _SCALES[0] < np.hypot(moved[0, 0], moved[0, 1]) < _SCALES[1]:
+        return False
+    if abs(np.arctan2(moved[1, 0], moved[0, 0])) > _MOST_ROLL:
         return False
     return int(np.count_nonzero(agrees)) >= _LEAST
 
