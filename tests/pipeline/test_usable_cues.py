@@ -35,6 +35,12 @@ def without_depth(sequence: Sequence) -> Sequence:
     return with_depth(sequence, np.full_like(depth_of(sequence), np.nan))
 
 
+def normalized(sequence: Sequence) -> Sequence:
+    assert sequence.tracks is not None
+    uv = sequence.tracks.uv / np.float32(sequence.image_size[::-1])
+    return dataclasses.replace(sequence, tracks=dataclasses.replace(sequence.tracks, uv=uv))
+
+
 def all_moving(sequence: Sequence) -> Sequence:
     return with_masks(sequence, np.ones_like(masks_of(sequence)))
 
@@ -45,6 +51,7 @@ def all_moving(sequence: Sequence) -> Sequence:
         (in_millimeters, r"outside 0.05 to 80 m in every frame \(its median is \d+.*check the unit"),
         (without_depth, "missing everywhere"),
         (all_moving, "mark every pixel of every frame as moving"),
+        (normalized, "lie within the first pixel, as normalized ones do; give pixels"),
     ],
 )
 def test_they_are_refused_before_a_folder_is_made(

@@ -8,6 +8,7 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.frontend.sequence.calibration import check_zoom
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
+from uni4d_fg.frontend.sequence.raw_tracks import normalization
 from uni4d_fg.frontend.sequence.selection import MIN_FRAMES
 
 _MAX_ROTATION_ERROR = 1e-6
@@ -53,6 +54,9 @@ def check_sequence(sequence: Sequence) -> None:
             )
         if ((tracks.query_frame < 0) | (tracks.query_frame >= count)).any():
             raise SequenceProblem(where, "a track starts in no frame of the video", f"give 0 to {count - 1}")
+        normalized = normalization(tracks.uv, tracks.visible, sequence.image_size)
+        if normalized is not None:
+            raise SequenceProblem(f"{where}: tracks", *normalized)
     if sequence.initial_world_T_cam is not None:
         _check_poses(where, sequence.initial_world_T_cam, count)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,31 @@ def test_tracks_never_visible(tmp_path: Path) -> None:
     visible[:, 2] = False
     rewrite_npz(root / "tracks.npz", visible=visible, uv=np.full((TRACKS, FRAMES, 2), 3.0))
     assert said(root, "warning") == [("tracks", f"{root / 'tracks.npz'}: no track is visible in frame(s) 2")]
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        (lambda uv: uv / (WIDTH, HEIGHT), "100 % of the visible observations lie within the first pixel"),
+        (lambda uv: 2 * uv / (WIDTH, HEIGHT) - 1, "100 % of the visible observations lie within the first pixel"),
+        (lambda uv: 2 * uv, "75 % of the visible observations lie outside the image of 16 x 12 px"),
+        (lambda uv: uv[..., ::-1], "25 % of the visible observations lie outside the image of 16 x 12 px"),
+    ],
+)
+def test_tracks_in_other_coordinates(tmp_path: Path, place: Callable[[np.ndarray], np.ndarray], words: str) -> None:
+    root = native_folder(tmp_path)
+    grid = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 1, 2)
+    uv = np.repeat(grid, FRAMES, axis=1).astype(np.float32)
+    (root / "ground_truth.npz").unlink()
+    whole = {"visible": np.ones(uv.shape[:2], bool), "query_frame": np.zeros(len(uv), int)}
+    np.savez(root / "tracks.npz", uv=uv, **whole)
+    assert validate_sequence(root).findings == ()
+    np.savez(root / "tracks.npz", uv=place(uv).astype(np.float32), **whole)
+    (found,) = said(root, "error")
+    assert found[0] == "tracks"
+    assert words in found[1]
+    with pytest.raises(InputError, match=words):
+        read_sequence(root)
 
 
 def test_many_broken_files_are_summed_up(tmp_path: Path) -> None:

@@ -14,6 +14,10 @@ from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.track_model import Tracks
 
 _CONFIDENCE_ROUNDING = 1e-3
+_MAX_MISPLACED = 0.2
+"""Share of visible observations outside the image: trackers leave a few there; swapped axes, a quarter and more."""
+_REACH = 1.0
+"""Normalized positions are below it, whether they begin at 0 or at its negative."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +92,13 @@ class RawTracks:
                 f"but these have {size[1]} x {size[0]} px",
                 "track the images that are in the sequence",
             )
+        elif (misplaced := misplacement(self.uv, seen, size)) is not None:
+            add(*misplaced)
         return found
 
     def outside(self, size: tuple[int, int]) -> BoolArray:
         """Return (K, T) True where a visible observation lies outside an image of ``size`` (height, width)."""
-        with np.errstate(invalid="ignore"):
-            x, y = self.uv[..., 0], self.uv[..., 1]
-            inside = (x >= 0) & (x < size[1]) & (y >= 0) & (y < size[0])
-        result: BoolArray = (self.visible == 1) & np.isfinite(x) & np.isfinite(y) & ~inside
-        return result
+        return _outside(self.uv, self.visible == 1, size)
 
     def to_tracks(self, num_frames: int, size: tuple[int, int]) -> Tracks:
         """Return checked tracks: visible where the file says so and inside the image, NaN elsewhere.
@@ -117,3 +119,45 @@ class RawTracks:
         if self.confidence is not None:
             confidence = np.clip(np.nan_to_num(self.confidence, nan=0.0), 0, 1).astype(np.float32)
         return Tracks(uv, visible, query, confidence)
+
+
+def misplacement(uv: npt.NDArray[Any], visible: BoolArray, size: tuple[int, int]) -> tuple[str, str] | None:
+    """Say what shows that positions are not pixels of the images, and the remedy, or return None.
+
+    Args:
+        uv: (K, T, 2) positions.
+        visible: (K, T).
+        size: (height, width) of the images, px.
+    """
+    normalized = normalization(uv, visible, size)
+    if normalized is not None:
+        return normalized
+    share = int(_outside(uv, visible, size).sum()) / max(int(visible.sum()), 1)
+    if share <= _MAX_MISPLACED:
+        return None
+    return (
+        f"{100 * share:.0f} % of the visible observations lie outside the image of {size[1]} x {size[0]} px",
+        "check that the tracks were made on images of this size, as (x, y); mark what left the image not visible",
+    )
+
+
+def normalization(uv: npt.NDArray[Any], visible: BoolArray, size: tuple[int, int]) -> tuple[str, str] | None:
+    """Say that positions are normalized, and the remedy, or return None; arguments as of :func:`misplacement`."""
+    with np.errstate(invalid="ignore"):
+        near = int((visible & ((uv >= -_REACH) & (uv < _REACH)).all(axis=2)).sum())
+    share = near / max(int(visible.sum()), 1)
+    if share <= 1.0 - _MAX_MISPLACED:
+        return None
+    return (
+        f"{100 * share:.0f} % of the visible observations lie within the first pixel, as normalized ones do",
+        f"give pixels: x from 0 to {size[1] - 1}, y from 0 to {size[0] - 1}",
+    )
+
+
+def _outside(uv: npt.NDArray[Any], visible: BoolArray, size: tuple[int, int]) -> BoolArray:
+    """Return (K, T) True where a visible observation of finite position lies outside the image."""
+    with np.errstate(invalid="ignore"):
+        x, y = uv[..., 0], uv[..., 1]
+        inside = (x >= 0) & (x < size[1]) & (y >= 0) & (y < size[0])
+    result: BoolArray = visible & np.isfinite(x) & np.isfinite(y) & ~inside
+    return result
