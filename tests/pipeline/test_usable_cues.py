@@ -10,14 +10,21 @@ import numpy as np
 import pytest
 from pipeline_scenes import TINY, depth_of, make_config, make_scene, masks_of, with_depth, with_masks
 
+from uni4d_fg.arrays import FloatArray
 from uni4d_fg.cues.plan import CuePlan
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.assemble import as_sequence, as_video
 from uni4d_fg.frontend.sequence.calibration import guess_intrinsics
 from uni4d_fg.frontend.sequence.model import Sequence
-from uni4d_fg.pipeline import reconstruct
+from uni4d_fg.geometry.lens import PINHOLE, Lens
+from uni4d_fg.pipeline import lens, reconstruct
 from uni4d_fg.pipeline.stream import stream_sequence
 from uni4d_fg.pipeline.usable_cues import check_given_cues
+from uni4d_fg.pipeline.warnings import found_focal_warnings
+from uni4d_fg.results.io import load_reconstruction
+from uni4d_fg.results.run_folder import RunFolder
+from uni4d_fg.slam.lens.calibration import LensCalibration
+from uni4d_fg.slam.lens.zoom import ZoomCalibration
 
 FREE = make_config().input
 FIXED = make_config("input.intrinsics=fixed").input
@@ -25,6 +32,12 @@ FIXED = make_config("input.intrinsics=fixed").input
 
 def scene() -> Sequence:
     return make_scene(TINY)
+
+
+def true_intrinsics() -> FloatArray:
+    truth = scene().ground_truth.intrinsics
+    assert truth is not None
+    return truth
 
 
 def in_millimeters(sequence: Sequence) -> Sequence:
@@ -111,3 +124,41 @@ def test_a_guess_is_not_called_given(tmp_path: Path) -> None:
         "focal lengths moved by" in text and f"{far.intrinsics[0]:.0f} px given" in text for text in given.warnings
     )
     assert not any("focal lengths moved" in text for text in [*batch.warnings, *stream.doubts])
+
+
+def moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: LensCalibration, given: FloatArray) -> list[str]:
+    monkeypatch.setattr(lens, "calibrate_with_shutter", lambda *_: found)
+    config = make_config("camera.rolling_shutter=off", "camera_init.max_depth_spread=null")
+    summary = reconstruct(dataclasses.replace(scene(), intrinsics=given), tmp_path, config)
+    return [text for text in summary.warnings if "focal lengths moved" in text]
+
+
+def test_focal_lengths_that_moved_are_those_of_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = true_intrinsics() * [1.5, 1.5, 1.0, 1.0]
+    half_way = true_intrinsics() * [1.25, 1.25, 1.0, 1.0]
+    (text,) = moved(tmp_path, monkeypatch, LensCalibration(Lens("SIMPLE_RADIAL", (-1e-6,)), half_way), given)
+    result = load_reconstruction(RunFolder(tmp_path).reconstruction).intrinsics
+    assert abs(result[0] / half_way[0] - 1.0) > 0.1
+    assert f"{result[:2].mean():.0f} px was found, and {given[0]:.0f} px given" in text
+
+
+def test_focal_lengths_that_a_zoom_moved_are_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ratio = np.linspace(0.9, 1.0, scene().num_frames)
+    zoom = ZoomCalibration(ratio, true_intrinsics(), 6.0, 0.0, ("the camera zooms",))
+    found = LensCalibration(PINHOLE, zoom.intrinsics, zoom=zoom)
+    longest = zoom.intrinsics[0]
+    (text,) = moved(tmp_path / "far", monkeypatch, found, zoom.intrinsics * [1.5, 1.5, 1.0, 1.0])
+    assert f"moved by 33 % from the given ones: {0.9 * longest:.0f} to {longest:.0f} px was found" in text
+    assert moved(tmp_path / "near", monkeypatch, found, zoom.intrinsics * [0.95, 0.95, 1.0, 1.0]) == []
+
+
+@pytest.mark.parametrize("guessed", [False, True])
+def test_a_focal_length_that_no_camera_has_is_said(guessed: bool) -> None:
+    sequence = dataclasses.replace(scene(), intrinsics_are_guessed=guessed)
+    assert found_focal_warnings(sequence, sequence.intrinsics[:2], (0.4, 3.0)) == []
+    text = found_focal_warnings(sequence, np.array([10.5, 10.6]), (0.4, 3.0))[-1]
+    assert "the focal length found (11 px, 0.13 of the longer image side) is unusual" in text
+    assert text.endswith("give K.npy if it is known" if guessed else "if those that were given are right")
+    # Given ones that stayed are warned of as given.
+    long = dataclasses.replace(sequence, intrinsics=np.array([400.0, 400.0, 39.5, 29.5]), intrinsics_are_guessed=False)
+    assert found_focal_warnings(long, long.intrinsics[:2], (0.4, 3.0)) == []

@@ -39,6 +39,7 @@ from uni4d_fg.cues.structure.motion import (
 from uni4d_fg.cues.structure.rotation_focal import focal_of_rotations
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import DegenerateProblemError, InputError
+from uni4d_fg.frontend.sequence.calibration import unusual_focal
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
@@ -183,7 +184,8 @@ def _with_maps(
         f"{100 * (1.0 - structure.unexplained):.0f} % of what was held out",
         *said,
     )
-    warnings = (*start_doubts(structure, video.image_size, settings), *doubts)
+    unusual = unusual_focal(float(np.mean(structure.intrinsics[:2])), video.image_size, settings.usual_focal)
+    warnings = (*start_doubts(structure), *unusual, *doubts)
     start = start_summary(structure)
     moving = np.zeros(tracks.num_tracks, dtype=bool)
     moving[structure.track] = structure.moving

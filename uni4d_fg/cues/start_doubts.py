@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
-from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.start_limits import MUCH_UNEXPLAINED, OPEN_FOCAL, RIVAL_DEGREES, RIVAL_DEGREES_PER_FRAME
 from uni4d_fg.cues.structure.motion import Structure
 from uni4d_fg.cues.structure.rivals import rotation_difference
@@ -18,18 +17,11 @@ _FEW_FRAMES = 0.5
 """Fewer frames with a pose than this part of the video are warned of."""
 
 
-def start_doubts(
-    structure: Structure,
-    image_size: tuple[int, int],
-    config: GeometricDepthConfig,
-    remedy: str = "give K.npy if it is known",
-) -> list[str]:
+def start_doubts(structure: Structure, remedy: str = "give K.npy if it is known") -> list[str]:
     """Return one sentence for everything that a reader should know of the cameras.
 
     Args:
         structure: Cameras and what is known of them.
-        image_size: (height, width), px.
-        config: Its field ``usual_focal``.
         remedy: What to do about a focal length that is open.
     """
     warnings = []
@@ -40,17 +32,7 @@ def start_doubts(
             f"{len(bridged)} frame(s) see too few points of the static scene, and their cameras are only interpolated"
             f"{' (most of the video: do not trust this result)' if severe else ''}: {some_of(bridged)}"
         )
-    warnings += _open_focal(structure, remedy)
-    warnings += _doubtful_start(structure)
-    focal = float(np.mean(structure.intrinsics[:2]))
-    side = float(max(image_size))
-    usual = config.usual_focal
-    if not usual[0] * side <= focal <= usual[1] * side:
-        warnings.append(
-            f"the focal length found ({focal:.0f} px, {focal / side:.2f} of the longer image side) is unusual: moving "
-            f"things without a mask, or motion from which it cannot be told; {remedy}"
-        )
-    return warnings
+    return warnings + _open_focal(structure, remedy) + _doubtful_start(structure)
 
 
 def doubts_of_masks(before: FloatArray, after: FloatArray) -> list[str]:

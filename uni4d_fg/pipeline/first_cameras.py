@@ -37,14 +37,13 @@ from uni4d_fg.pipeline.in_progress import RunInProgress
 from uni4d_fg.pipeline.lens import as_pinhole, found_camera
 from uni4d_fg.pipeline.steps import STOPPED, Arrays, camera_init_step
 from uni4d_fg.pipeline.store import StageRecord
-from uni4d_fg.pipeline.warnings import focal_warnings
+from uni4d_fg.pipeline.warnings import KEEP_GIVEN
 from uni4d_fg.progress import Reporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.lifting import frame_log_scales
 from uni4d_fg.slam.stages.observations import Observations, observations_of
 
 _STEP = "structure_from_motion"
-_REMEDY = "set input.intrinsics=fixed if those that were given are right"
 
 _POSED = 0.9
 """Part of the frames that must have a pose: stage 2 finds that of others, from one between those of their neighbors."""
@@ -203,9 +202,6 @@ def _structure_step(
     camera = found.camera.facts()
     if beside_cue is not None and not beside_cue.is_plain and not camera:
         camera = ["the tracks alone ask for a pinhole that does not zoom"]
-    # Stage 2 says so of a pinhole; those of a lens it takes for given.
-    bent = not found.camera.lens.is_pinhole and beside_cue is not None
-    moved = focal_warnings(sequence.given_intrinsics, found.intrinsics[:2]) if bent else []
     summary: dict[str, Any] = {
         "facts": [
             f"{said}, so the tracks alone find the cameras: fx {found.intrinsics[0]:.1f} px, known to "
@@ -214,7 +210,7 @@ def _structure_step(
         ],
         "depth_spread": spread,
         "start": start_summary(found),
-        "warnings": [*moved, *start_doubts(found, sequence.image_size, config.geometric_depth, _REMEDY)],
+        "warnings": start_doubts(found, KEEP_GIVEN),
     }
     arrays = {
         "world_T_cam": poses, "intrinsics": found.intrinsics, "focal_sigma": np.array(found.focal_sigma),

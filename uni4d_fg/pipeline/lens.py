@@ -19,7 +19,6 @@ from uni4d_fg.optim.stage import StageRunner
 from uni4d_fg.pipeline.steps import STOPPED
 from uni4d_fg.pipeline.store import StageRecord
 from uni4d_fg.pipeline.summary import solve_dict
-from uni4d_fg.pipeline.warnings import focal_warnings
 from uni4d_fg.slam.lens.calibration import LensCalibration
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.rolling_shutter import Readout, readout_to_array
@@ -149,14 +148,11 @@ def lens_step(
     except Cancelled as error:
         raise Cancelled(STOPPED) from error
     zoom, camera = found.zoom, found.camera
-    # A pinhole's move on in bundle adjustment, which has its own look at them; those of a zoom are no single ones.
-    alone = not camera.lens.is_pinhole and camera.zoom is None
-    doubts = focal_warnings(sequence.given_intrinsics, found.intrinsics[:2]) if alone else []
     summary: dict[str, Any] = {
         "solves": [solve_dict(solve) for solve in found.solves],
         "facts": found.facts(),
         "camera_model": found.lens.model,
-        "warnings": [*doubts, *([] if zoom is None else zoom.warnings)],
+        "warnings": [] if zoom is None else list(zoom.warnings),
         "candidates": [
             {
                 "camera_model": c.lens.model,

@@ -61,7 +61,7 @@ from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, nonrigid_ste
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary
 from uni4d_fg.pipeline.usable_cues import check_given_cues
-from uni4d_fg.pipeline.warnings import blur_warnings
+from uni4d_fg.pipeline.warnings import blur_warnings, found_focal_warnings
 from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -234,6 +234,8 @@ def _solve(run: RunInProgress, windows: list[Window], measured: Measurements, ru
         )
     )
     key, scene, motion = _stages(run, key, inputs, poses, windows, run_stage, fragments, loops, static)
+    found = zoomed(scene["intrinsics"], zoom, sequence.num_frames)[:, :2]
+    summary.warnings += found_focal_warnings(sequence, found, config.geometric_depth.usual_focal)
     camera_facts: list[str] = []
     if goes_along(camera, sequence):
         camera = camera.with_intrinsics(scene["intrinsics"])

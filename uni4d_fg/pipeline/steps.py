@@ -212,8 +212,9 @@ def bundle_summary(
     ]
     if sequence.intrinsics_are_guessed:
         facts.append(started_from_a_guess(sequence.intrinsics))
+    # How far focal lengths moved, a lens or a zoom among what moved them, is known at the end of the run.
     warnings = scene_warnings(
-        sequence.given_intrinsics, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
+        None, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
         arrays["intrinsics_covariance"], focal_was_doubted=sequence.focal_sigma is not None,
         depth_parallax=sequence.depth_parallax,
     )  # fmt: skip

@@ -30,7 +30,7 @@ from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
 from uni4d_fg.pipeline.usable_cues import check_given_cues
-from uni4d_fg.pipeline.warnings import scene_warnings, started_from_a_guess
+from uni4d_fg.pipeline.warnings import found_focal_warnings, scene_warnings, started_from_a_guess
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.incremental.boundary import checked_intrinsics
@@ -232,8 +232,9 @@ def _stream(
     reconstruction = solver.collect(path)
     write_result(RunFolder(run_dir), reconstruction)
     seconds["total"] = earlier + time.perf_counter() - began
-    doubts = scene_warnings(
-        sequence.given_intrinsics, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
+    doubts = found_focal_warnings(sequence, reconstruction.intrinsics[:2], config.geometric_depth.usual_focal)
+    doubts += scene_warnings(
+        None, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
         intrinsics_covariance=reconstruction.intrinsics_covariance, depth_parallax=sequence.depth_parallax,
     )  # fmt: skip
     facts = []

@@ -8,6 +8,8 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
 from uni4d_fg.counted import counted
+from uni4d_fg.frontend.sequence.calibration import unusual_focal
+from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.robust import WITHIN_95
@@ -24,6 +26,9 @@ _DEPTH_IS_FROM = {
     True: ", from which all depth was found",
     False: ", which was assumed",
 }
+
+KEEP_GIVEN = "set input.intrinsics=fixed if those that were given are right"
+"""What to do about focal lengths that are doubtful where some were given."""
 
 _MOVES_SIGMAS, _MOVES_PART = 3.0, 0.01
 """Median reprojection error of a track that does not fit a static world: as a multiple of the noise, and at least, as a
@@ -100,16 +105,42 @@ def started_from_a_guess(guessed_intrinsics: FloatArray) -> str:
 
 
 def focal_warnings(given_intrinsics: FloatArray | None, focal_px: FloatArray) -> list[str]:
-    """Return a sentence if focal lengths (2,), px, are far from the given intrinsics (4,), if any were given."""
+    """Return a sentence if focal lengths are far from the given intrinsics (4,), px, if any were given.
+
+    Args:
+        given_intrinsics: None where they were guessed.
+        focal_px: (2,) px, or (F, 2) of a camera that zooms, of which the given ones may be those of any frame.
+    """
     if given_intrinsics is None:
         return []
-    change = float(np.abs(focal_px / given_intrinsics[:2] - 1.0).max())
+    focal_px = np.atleast_2d(focal_px)
+    change = float(np.abs(focal_px / given_intrinsics[:2] - 1.0).max(axis=1).min())
     if change <= _MAX_FOCAL_CHANGE:
         return []
+    shortest, longest = (f"{focal:.0f}" for focal in (focal_px.mean(axis=1).min(), focal_px.mean(axis=1).max()))
+    found = shortest if shortest == longest else f"{shortest} to {longest}"
     return [
-        f"the focal lengths moved by {100 * change:.0f} % from the given ones: {focal_px.mean():.0f} px was found, and "
+        f"the focal lengths moved by {100 * change:.0f} % from the given ones: {found} px was found, and "
         f"{given_intrinsics[:2].mean():.0f} px given"
     ]
+
+
+def found_focal_warnings(sequence: Sequence, focal_px: FloatArray, usual: tuple[float, float]) -> list[str]:
+    """Return what is odd about the focal lengths that a run ends with.
+
+    Those that camera motion told before the run are doubted where it does.
+
+    Args:
+        sequence: As it came in.
+        focal_px: (2,) px, or (F, 2) of a camera that zooms.
+        usual: Range of focal lengths that cameras have, as parts of the longer image side.
+    """
+    moved = focal_warnings(sequence.given_intrinsics, focal_px)
+    if sequence.focal_sigma is not None or sequence.depth_parallax is not None:
+        return moved
+    if sequence.intrinsics_are_guessed:
+        return unusual_focal(float(focal_px.mean()), sequence.image_size, usual)
+    return moved + (unusual_focal(float(focal_px.mean()), sequence.image_size, usual, KEEP_GIVEN) if moved else [])
 
 
 def scene_warnings(
@@ -126,7 +157,8 @@ def scene_warnings(
     """Return one sentence for everything that makes a static scene doubtful.
 
     Args:
-        given_intrinsics: (4,) fx, fy, cx, cy, px, that the solve started from; None where that was a guess.
+        given_intrinsics: (4,) fx, fy, cx, cy, px, that the solve started from; None where that was a guess, or where
+            whoever calls says how far the focal lengths moved.
         intrinsics: (4,) that it ended with.
         world_T_cam: (T, 4, 4) poses.
         landmarks: (N, 3) world, meters.

@@ -112,6 +112,26 @@ def center_outside(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
     return f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px"
 
 
+def unusual_focal(
+    focal_px: float, size: tuple[int, int], usual: tuple[float, float], remedy: str = "give K.npy if it is known"
+) -> list[str]:
+    """Return a sentence if a focal length that was found is none that cameras have.
+
+    Args:
+        focal_px: What was found.
+        size: (height, width) of the images, px.
+        usual: Range of focal lengths that cameras have, as parts of the longer image side.
+        remedy: What to do about another one.
+    """
+    part = focal_px / max(size)
+    if usual[0] <= part <= usual[1]:
+        return []
+    return [
+        f"the focal length found ({focal_px:.0f} px, {part:.2f} of the longer image side) is unusual: moving things "
+        f"without a mask, or motion from which it cannot be told; {remedy}"
+    ]
+
+
 def implausible(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
     """Say what is odd about (4,) intrinsics for images of ``size`` (height, width), or return None."""
     fx, fy, cx, cy = (float(v) for v in intrinsics)
