@@ -32,8 +32,12 @@ def passes(
     *,
     has_parallax: bool = True,
     at_once: bool = True,
+    given: np.ndarray | None = None,
+    warnings: list[str] | None = None,
 ) -> tuple[list[tuple[CameraModel | None, StartCameras | None]], list[Any], np.ndarray]:
-    """Gather cues of frames alone with a structure from motion that finds a camera.
+    """Gather cues of frames alone, or with given intrinsics, with a structure from motion that finds a camera.
+
+    Warnings of the report are added to ``warnings``.
 
     Returns:
         Cameras that are known and to start from in each pass; poses that masks are made with; those that were found.
@@ -62,8 +66,10 @@ def passes(
     monkeypatch.setattr(gather, "load_or_track", lambda *_: tracks)
     monkeypatch.setattr(gather, "save_manifest", lambda *_: None)
     images = ArrayFrames(np.zeros((FRAMES, *SIZE, 3), np.uint8))
-    video = Video("clip", images, SIZE, np.arange(FRAMES) / 30.0)
-    gather.gather_cues(video, plan_cues(video, bare=True), folder, load_config("default", []))
+    video = Video("clip", images, SIZE, np.arange(FRAMES) / 30.0, intrinsics=given)
+    _, report = gather.gather_cues(video, plan_cues(video, bare=True), folder, load_config("default", []))
+    if warnings is not None:
+        warnings += report.warnings
     return calls, masked, poses
 
 
@@ -71,6 +77,17 @@ def test_the_first_pass_knows_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
     calls, _, _ = passes(CameraModel(INTRINSICS), tmp_path, monkeypatch)
     assert len(calls) == 2
     assert calls[0] == (None, None)
+
+
+@pytest.mark.parametrize(("focal", "odd"), [(70.0, False), (2000.0, True)])
+def test_odd_intrinsics_that_motion_starts_from_are_warned_of(
+    focal: float, odd: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warnings: list[str] = []
+    given = np.array([focal, focal, 39.5, 29.5])
+    passes(CameraModel(INTRINSICS), tmp_path, monkeypatch, given=given, warnings=warnings)
+    said = [text for text in warnings if "the given intrinsics are odd: focal length 2000.0 px is unusual" in text]
+    assert len(said) == odd
 
 
 def test_where_all_tracks_ask_for_a_pinhole_no_other_camera_is_looked_for(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -48,6 +49,14 @@ def without_depth(sequence: Sequence) -> Sequence:
     return with_depth(sequence, np.full_like(depth_of(sequence), np.nan))
 
 
+def in_other_units(sequence: Sequence) -> Sequence:
+    return dataclasses.replace(sequence, intrinsics=np.array([4.2, 4.2, 39.5, 29.5]))
+
+
+def of_other_images(sequence: Sequence) -> Sequence:
+    return dataclasses.replace(sequence, intrinsics=sequence.intrinsics * 4.0)
+
+
 def normalized(sequence: Sequence) -> Sequence:
     assert sequence.tracks is not None
     uv = sequence.tracks.uv / np.float32(sequence.image_size[::-1])
@@ -64,6 +73,8 @@ def all_moving(sequence: Sequence) -> Sequence:
         (in_millimeters, r"outside 0.05 to 80 m in every frame \(its median is \d+.*check the unit"),
         (without_depth, "missing everywhere"),
         (all_moving, "mark every pixel of every frame as moving"),
+        (in_other_units, "focal length 4.2 px is that of no camera with images of 80 x 60 px"),
+        (of_other_images, "lies outside the image of 80 x 60 px"),
         (normalized, "lie within the first pixel, as normalized ones do; give pixels"),
     ],
 )
@@ -124,6 +135,17 @@ def test_a_guess_is_not_called_given(tmp_path: Path) -> None:
         "focal lengths moved by" in text and f"{far.intrinsics[0]:.0f} px given" in text for text in given.warnings
     )
     assert not any("focal lengths moved" in text for text in [*batch.warnings, *stream.doubts])
+
+
+def test_odd_intrinsics_are_warned_of(tmp_path: Path) -> None:
+    far = dataclasses.replace(scene(), intrinsics=np.array([1000.0, 1000.0, 39.5, 29.5]))
+    said = "the given intrinsics are odd: focal length 1000.0 px is unusual for an image 80 px wide; check that"
+    for run in (reconstruct, stream_sequence):
+        run(far, tmp_path / run.__name__, make_config("input.intrinsics=fixed"))
+        warnings = json.loads(RunFolder(tmp_path / run.__name__).summary.read_text())["warnings"]
+        assert [said in text for text in warnings].count(True) == 1
+    # What camera motion told is doubted where it does.
+    assert found_focal_warnings(dataclasses.replace(far, focal_sigma=0.1), far.intrinsics[:2], (0.4, 3.0)) == []
 
 
 def moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: LensCalibration, given: FloatArray) -> list[str]:

@@ -86,6 +86,7 @@ def reconstruct(
     from uni4d_fg.pipeline.asked import check_asked
     from uni4d_fg.pipeline.measurements import MeasurementFiles, read_measurements
     from uni4d_fg.pipeline.usable_cues import check_given_cues
+    from uni4d_fg.pipeline.warnings import intrinsics_warnings
     from uni4d_fg.pipeline.workers.options import WorkerOptions
     from uni4d_fg.results.shot_list import check_same_split
 
@@ -118,7 +119,7 @@ def reconstruct(
     check_asked(opened.video, settings, samples)
     check_given_cues(opened.video, settings.input, plan)
     if not (quiet or json):
-        for text in order_warnings(opened.video.frame_names):
+        for text in [*order_warnings(opened.video.frame_names), *intrinsics_warnings(opened.video)]:
             typer.echo(f"warning: {text}", err=True)  # before the work: it would all be in vain
     files = MeasurementFiles(odometry, gps, relative_poses)
     is_measured = any(given is not None for given in (imu, odometry, gps, relative_poses))

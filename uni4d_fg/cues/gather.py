@@ -25,7 +25,7 @@ from uni4d_fg.cues.structure.motion import StartCameras
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.bars import without_bars
-from uni4d_fg.frontend.sequence.calibration import guess_intrinsics
+from uni4d_fg.frontend.sequence.calibration import given_doubts, guess_intrinsics
 from uni4d_fg.frontend.sequence.frames import no_masks
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.track_model import Tracks
@@ -138,6 +138,8 @@ class _Gathering:
         guessed = self.intrinsics is None and self.intrinsics_of_motion is None
         if guessed:
             report.sources["intrinsics"] = GUESSED
+        if self.intrinsics_of_motion is not None and self.video.intrinsics is not None:
+            self.motion_warnings[:0] = given_doubts(self.video.intrinsics, self.video.image_size)
         report.facts += self.motion_facts
         report.warnings[:0] = self.motion_warnings
         sequence = as_sequence(

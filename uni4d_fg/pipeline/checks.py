@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
-from uni4d_fg.frontend.sequence.calibration import check_zoom
+from uni4d_fg.frontend.sequence.calibration import check_intrinsics, check_zoom
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
 from uni4d_fg.frontend.sequence.raw_tracks import normalization
@@ -40,6 +40,9 @@ def check_sequence(sequence: Sequence) -> None:
             f"intrinsics {shown} are not fx, fy, cx, cy with positive focal lengths",
             "give (4,) pixels",
         )
+    if sequence.focal_sigma is None and sequence.depth_parallax is None:
+        # What camera motion told is doubted where it is found, and no mistake of units.
+        check_intrinsics(intrinsics, sequence.image_size, where)
     check_zoom(sequence.zoom, count, where)
     times = sequence.timestamps
     if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():

@@ -61,7 +61,7 @@ from uni4d_fg.pipeline.steps import Arrays, bundle_adjustment_step, nonrigid_ste
 from uni4d_fg.pipeline.store import StageRecord, StageStore
 from uni4d_fg.pipeline.summary import RunSummary
 from uni4d_fg.pipeline.usable_cues import check_given_cues
-from uni4d_fg.pipeline.warnings import blur_warnings, found_focal_warnings
+from uni4d_fg.pipeline.warnings import blur_warnings, found_focal_warnings, intrinsics_warnings
 from uni4d_fg.pipeline.window_workers import NOT_ON_WORKERS, window_workers
 from uni4d_fg.pipeline.windowed import WindowedRun, motion_step, scene_step
 from uni4d_fg.pipeline.workers.options import WorkerOptions
@@ -171,7 +171,13 @@ def _reconstruct(
         },
         solver_facts(config),
         cues=cues,
-        warnings=[*order_warnings(sequence.frame_names), *cues.get("warnings", []), *measured.warnings, *warnings],
+        warnings=[
+            *order_warnings(sequence.frame_names),
+            *intrinsics_warnings(sequence),
+            *cues.get("warnings", []),
+            *measured.warnings,
+            *warnings,
+        ],
     )
     on = None
     if windows and not sources:

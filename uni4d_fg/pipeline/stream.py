@@ -30,10 +30,9 @@ from uni4d_fg.pipeline.stream_folder import StreamFolder
 from uni4d_fg.pipeline.stream_key import StreamKey
 from uni4d_fg.pipeline.summary import peak_memory_mb, versions
 from uni4d_fg.pipeline.usable_cues import check_given_cues
-from uni4d_fg.pipeline.warnings import found_focal_warnings, scene_warnings, started_from_a_guess
+from uni4d_fg.pipeline.warnings import found_focal_warnings, intrinsics_warnings, scene_warnings, started_from_a_guess
 from uni4d_fg.results.run_contents import mark_run, run_lock
 from uni4d_fg.results.run_folder import RunFolder
-from uni4d_fg.slam.incremental.boundary import checked_intrinsics
 from uni4d_fg.slam.incremental.model import FrameStatus, FrameTracks, FrameUpdate
 from uni4d_fg.slam.incremental.reconstructor import IncrementalReconstructor, check_incremental
 
@@ -118,7 +117,6 @@ def check_stream(sequence: Sequence, config: Config) -> None:
             "a stream finds its cameras itself: leave input.poses 'estimate', or use `uni4d-fg reconstruct`"
         )
     check_incremental(config)
-    checked_intrinsics(sequence.intrinsics, sequence.image_size)
 
 
 def not_in_streams(config: Config) -> list[str]:
@@ -176,6 +174,7 @@ def stream_sequence(
             facts=[*summary.facts, *measured.facts],
             doubts=[
                 *order_warnings(sequence.frame_names),
+                *intrinsics_warnings(sequence),
                 *not_in_streams(config),
                 *([] if sequence.depth_is_metric else [NOT_METRIC_GIVEN]),
                 *summary.doubts,

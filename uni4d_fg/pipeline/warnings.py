@@ -8,8 +8,8 @@ import numpy as np
 
 from uni4d_fg.arrays import Float32Array, FloatArray, IntArray
 from uni4d_fg.counted import counted
-from uni4d_fg.frontend.sequence.calibration import unusual_focal
-from uni4d_fg.frontend.sequence.model import Sequence
+from uni4d_fg.frontend.sequence.calibration import given_doubts, unusual_focal
+from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
 from uni4d_fg.robust import WITHIN_95
@@ -104,6 +104,14 @@ def started_from_a_guess(guessed_intrinsics: FloatArray) -> str:
     return f"no intrinsics were given: the focal length started from a guess, {guessed_intrinsics[0]:.0f} px"
 
 
+def intrinsics_warnings(video: Video | Sequence) -> list[str]:
+    """Return a sentence if given intrinsics are odd; those that camera motion told are doubted where it does."""
+    given = video.intrinsics if isinstance(video, Video) else video.given_intrinsics
+    if given is None or video.focal_sigma is not None or video.depth_parallax is not None:
+        return []
+    return given_doubts(given, video.image_size)
+
+
 def focal_warnings(given_intrinsics: FloatArray | None, focal_px: FloatArray) -> list[str]:
     """Return a sentence if focal lengths are far from the given intrinsics (4,), px, if any were given.
 
@@ -128,7 +136,8 @@ def focal_warnings(given_intrinsics: FloatArray | None, focal_px: FloatArray) ->
 def found_focal_warnings(sequence: Sequence, focal_px: FloatArray, usual: tuple[float, float]) -> list[str]:
     """Return what is odd about the focal lengths that a run ends with.
 
-    Those that camera motion told before the run are doubted where it does.
+    Those that camera motion told before the run are doubted where it does, and those that were given and stayed there
+    by :func:`intrinsics_warnings`.
 
     Args:
         sequence: As it came in.

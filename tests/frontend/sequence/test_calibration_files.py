@@ -143,3 +143,33 @@ def test_nerfstudio(tmp_path: Path, lens: Lens) -> None:
 def test_what_is_no_calibration_is_refused(tmp_path: Path, name: str, text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         load_calibration(written(tmp_path / name, text), 5, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "words"),
+    [
+        ([4.2, 4.2, 319.5, 239.5], r"focal length 4.2 px is that of no camera with images of 640 x 480 px.*in pixels"),
+        ([0.9, 1.2, 0.5, 0.5], "it seems to be in mm, or normalized; give fx, fy, cx, cy in pixels"),
+        ([500, 510, 1600, 1200], r"principal point \(1600.0, 1200.0\) lies outside the image of 640 x 480 px; give"),
+        ([1000, 1020, 639.5, 479.5], "lies outside the image"),
+    ],
+)
+@pytest.mark.parametrize("name", ["K.npy", "c.yaml"])
+def test_other_units_and_other_images_are_refused(
+    tmp_path: Path, name: str, intrinsics: list[float], words: str
+) -> None:
+    path = tmp_path / name
+    if name == "K.npy":
+        np.save(path, np.array(intrinsics))
+    else:
+        fx, fy, cx, cy = intrinsics
+        written(path, f"camera_matrix: [{fx}, 0, {cx}, 0, {fy}, {cy}, 0, 0, 1]\n")
+    with pytest.raises(InputError, match=words) as error:
+        load_calibration(path, 5, SIZE)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("intrinsics", [[102.0, 102, 319.5, 239.5], [9000, 9000, 319.5, 239.5], [500, 500, 0, 479]])
+def test_what_is_only_odd_is_taken(tmp_path: Path, intrinsics: list[float]) -> None:
+    np.save(tmp_path / "K.npy", np.array(intrinsics))
+    np.testing.assert_array_equal(load_calibration(tmp_path / "K.npy", 5, SIZE).intrinsics, intrinsics)

@@ -148,7 +148,13 @@ def test_cues_named_after_other_frames(tmp_path: Path) -> None:
 def test_intrinsics(tmp_path: Path) -> None:
     root = native_folder(tmp_path)
     np.save(root / "K.npy", np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]]))
-    assert "principal point (320.0, 240.0) lies outside the image of 16 x 12 px" in said(root, "warning")[0][1]
+    # A run refuses them, too.
+    assert "principal point (320.0, 240.0) lies outside the image of 16 x 12 px" in said(root, "error")[0][1]
+    with pytest.raises(InputError, match=r"K.npy: principal point \(320.0, 240.0\) lies outside"):
+        read_sequence(root)
+    np.save(root / "K.npy", np.array([[585.0, 0, 7.5], [0, 585, 5.5], [0, 0, 1]]))
+    assert said(root, "warning")[0][1].endswith("K.npy: focal length 585.0 px is unusual for an image 16 px wide")
+    read_sequence(root)
     (root / "K.npy").unlink()
     assert said(root, "warning") == [("intrinsics", "there is no K.npy: a focal length of 16 px is guessed")]
 

@@ -11,7 +11,13 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
 from uni4d_fg.errors import InputError
 from uni4d_fg.files import load_npz
-from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, check_zoom, guess_intrinsics, load_intrinsics
+from uni4d_fg.frontend.sequence.calibration import (
+    VaryingIntrinsics,
+    check_zoom,
+    guess_intrinsics,
+    load_given_intrinsics,
+    load_intrinsics,
+)
 from uni4d_fg.frontend.sequence.decode import check_bit_depth
 from uni4d_fg.frontend.sequence.frames import DepthFolder, ImageFolder, LazyFrames, MaskFolder, NpyDepth, no_masks
 from uni4d_fg.frontend.sequence.layout import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MASK_SUFFIXES, SequenceFiles, list_frames
@@ -296,7 +302,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
         lens=note.lens,
         zoom=note.zoom,
         masks=masks,
-        intrinsics=None if files.intrinsics is None else load_intrinsics(files.intrinsics, num_frames, size),
+        intrinsics=None if files.intrinsics is None else load_given_intrinsics(files.intrinsics, num_frames, size),
         tracks=tracks,
         root=files.root,
         frame_names=frame_names(images),

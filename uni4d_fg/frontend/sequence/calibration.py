@@ -19,6 +19,12 @@ MAX_SKEW = 1e-3
 """Largest skew, as a part of the focal length, that is taken for zero."""
 
 
+MIN_FOCAL = 0.1
+"""Of the longer image side: an equidistant fisheye that sees all around has 0.16, what is in mm or normalized mostly
+less."""
+CHECK_SIZE = "check that they were made for images of this size"
+
+
 class VaryingIntrinsics(SequenceProblem):
     """The intrinsics change along the video (zoom), which one shared camera cannot express."""
 
@@ -103,13 +109,54 @@ def shared_intrinsics(values: npt.NDArray[Any], path: Path, num_frames: int, siz
     return mean
 
 
-def center_outside(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
-    """Say that the principal point of (4,) intrinsics is outside images of ``size`` (height, width), or return None."""
+def load_given_intrinsics(path: Path, num_frames: int, size: tuple[int, int]) -> FloatArray:
+    """Read intrinsics that a solve starts from; arguments and result as in :func:`load_intrinsics`.
+
+    Raises:
+        VaryingIntrinsics: If the frames' matrices differ by more than 1 %.
+        InputError: As :func:`load_intrinsics` and :func:`check_intrinsics`.
+    """
+    intrinsics = load_intrinsics(path, num_frames, size)
+    check_intrinsics(intrinsics, size, path)
+    return intrinsics
+
+
+def check_intrinsics(intrinsics: FloatArray, size: tuple[int, int], where: Path | str) -> None:
+    """Check that (4,) intrinsics, px, can be those of a camera with images of ``size`` (height, width), px.
+
+    Raises:
+        InputError: If a focal length is below a tenth of the longer image side, or the principal point lies outside the
+            image.
+    """
+    fault = _impossible(intrinsics, size)
+    if fault is not None:
+        raise SequenceProblem(where, *fault)
+
+
+def _impossible(intrinsics: FloatArray, size: tuple[int, int]) -> tuple[str, str] | None:
+    """Return why no camera with images of ``size`` (height, width) has (4,) intrinsics, and the remedy, or None."""
+    shortest = float(intrinsics[:2].min())
     cx, cy = (float(v) for v in intrinsics[2:])
     height, width = size
-    if 0 <= cx < width and 0 <= cy < height:
-        return None
-    return f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px"
+    if shortest < MIN_FOCAL * max(size):
+        return (
+            f"focal length {shortest:g} px is that of no camera with images of {width} x {height} px: it seems to be "
+            "in mm, or normalized",
+            "give fx, fy, cx, cy in pixels: mm times the image width over the sensor width, normalized ones times the "
+            "image width (fx, cx) and height (fy, cy)",
+        )
+    if not (-0.5 < cx < width - 0.5 and -0.5 < cy < height - 0.5):
+        return (
+            f"principal point ({cx:.1f}, {cy:.1f}) lies outside the image of {width} x {height} px",
+            "give the calibration of images of this size: scale fx, fy, cx and cy as the images were scaled",
+        )
+    return None
+
+
+def given_doubts(intrinsics: FloatArray, size: tuple[int, int]) -> list[str]:
+    """Return a sentence if given intrinsics (4,), px, are odd for images of ``size`` (height, width)."""
+    odd = implausible(intrinsics, size)
+    return [] if odd is None else [f"the given intrinsics are odd: {odd}; {CHECK_SIZE}"]
 
 
 def unusual_focal(
@@ -136,9 +183,9 @@ def implausible(intrinsics: FloatArray, size: tuple[int, int]) -> str | None:
     """Say what is odd about (4,) intrinsics for images of ``size`` (height, width), or return None."""
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     height, width = size
-    outside = center_outside(intrinsics, size)
-    if outside is not None:
-        return outside
+    fault = _impossible(intrinsics, size)
+    if fault is not None:
+        return fault[0]
     if abs(cx - (width - 1) / 2) > 0.25 * width or abs(cy - (height - 1) / 2) > 0.25 * height:
         return f"principal point ({cx:.1f}, {cy:.1f}) is far from the center of the {width} x {height} px image"
     if not 0.2 * width < fx < 10 * width:

@@ -13,7 +13,14 @@ from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence import assemble, naming
-from uni4d_fg.frontend.sequence.calibration import VaryingIntrinsics, guess_intrinsics, implausible, load_intrinsics
+from uni4d_fg.frontend.sequence.calibration import (
+    CHECK_SIZE,
+    VaryingIntrinsics,
+    guess_intrinsics,
+    implausible,
+    load_given_intrinsics,
+    load_intrinsics,
+)
 from uni4d_fg.frontend.sequence.decode import MIN_16_BIT_RANGE, check_bit_depth, is_16_bit_png
 from uni4d_fg.frontend.sequence.frame_checks import usable_depth
 from uni4d_fg.frontend.sequence.frames import FileFrames, ImageFolder, LazyFrames
@@ -263,12 +270,10 @@ class _Validation:
                 "add K.npy, or leave the intrinsics free",
             )
             return
-        intrinsics = self._array("intrinsics", lambda p: load_intrinsics(p, num_frames, size), path)
+        intrinsics = self._array("intrinsics", lambda p: load_given_intrinsics(p, num_frames, size), path)
         odd = None if intrinsics is None else implausible(intrinsics, size)
         if odd:
-            self.findings.add(
-                "warning", "intrinsics", f"{path}: {odd}", "check that they were made for images of this size"
-            )
+            self.findings.add("warning", "intrinsics", f"{path}: {odd}", CHECK_SIZE)
 
     def _tracks(self, path: Path | None, num_frames: int, size: tuple[int, int]) -> None:
         if path is None:

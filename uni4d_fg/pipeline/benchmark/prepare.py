@@ -18,7 +18,7 @@ from uni4d_fg.cues.plan import MaskSource, plan_cues
 from uni4d_fg.errors import Cancelled, InputError, Uni4dFgError
 from uni4d_fg.frontend.datasets.registry import find_dataset
 from uni4d_fg.frontend.sequence.assemble import as_sequence, check_count, load_tracks, open_depth, open_masks
-from uni4d_fg.frontend.sequence.calibration import load_intrinsics
+from uni4d_fg.frontend.sequence.calibration import load_given_intrinsics
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
 from uni4d_fg.frontend.sequence.native import find_native_files
 from uni4d_fg.frontend.sequence.resize import resize_video
@@ -76,7 +76,7 @@ def with_cues(video: Video, folder: Path) -> Video:
     if files.tracks is not None:
         changes["tracks"] = load_tracks(files, files.tracks, count).to_tracks(count, size)
     if files.intrinsics is not None:
-        changes["intrinsics"] = load_intrinsics(files.intrinsics, count, size)
+        changes["intrinsics"] = load_given_intrinsics(files.intrinsics, count, size)
     if not changes:
         raise InputError(f"{folder}: holds no cue; put depth_cue/, masks/, tracks.npz or Uni4D's folders there")
     return replace(video, **changes)

@@ -16,7 +16,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, FloatArray, ImageArray, Int32Array
 from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.errors import DegenerateProblemError, InputError, SolverError
-from uni4d_fg.frontend.sequence.calibration import center_outside
+from uni4d_fg.frontend.sequence.calibration import check_intrinsics
 from uni4d_fg.frontend.sequence.frame_checks import (
     checked_depth,
     checked_image,
@@ -171,14 +171,12 @@ def checked_intrinsics(intrinsics: Any, image_size: tuple[int, int]) -> FloatArr
     """Return a copy of intrinsics (4,) fx, fy, cx, cy, px, of images of ``image_size`` (height, width).
 
     Raises:
-        InputError: If they are not finite, or a focal length is not positive, or the principal point is outside.
+        InputError: If they are not finite, or those of no camera with such images.
     """
     array = np.array(intrinsics, dtype=np.float64)
     if array.shape != (4,) or not np.isfinite(array).all() or (array[:2] <= 0).any():
         raise InputError(f"intrinsics must be fx, fy, cx, cy in px with positive focal lengths, got {array}")
-    outside = center_outside(array, image_size)
-    if outside is not None:
-        raise InputError(f"intrinsics: the {outside}; give fx, fy, cx, cy in px of these images")
+    check_intrinsics(array, image_size, "intrinsics")
     return array
 
 
