@@ -52,12 +52,14 @@ def test_an_earlier_run_is_replaced_or_continued_only_where_that_is_asked_for(tm
     np.testing.assert_array_equal(again.world_T_cam, first.world_T_cam)
 
     fg.export_run(Run(run), ["tum"])
-    (run / "report.html").write_text("of the earlier run")
+    for page in ("report.html", "share.html"):
+        (run / page).write_text("of the earlier run")
     (run / "notes.txt").write_text("mine")
     reconstruct(run, overwrite=True)
     assert not any(resumed(run).values())
     assert not (run / "export").exists()
     assert not (run / "report.html").exists()
+    assert not (run / "share.html").exists()
     assert (run / "notes.txt").read_text() == "mine"
 
 

@@ -35,7 +35,7 @@ _MAX_MARKER_BYTES = 64 * 1024**2
 _TEMPORARY = re.compile(r"\.tmp-[0-9a-f]{8}-(?P<name>.+)")
 _ROOT_FILES = (
     MARKER, STORED_INPUT, "config.yaml", "summary.json", "reconstruction.npz", "trajectory.tum", "depth.npy",
-    "confidence.npy", "labels.npz", "report.html", "shots.json",
+    "confidence.npy", "labels.npz", "report.html", "share.html", "shots.json",
 )  # fmt: skip
 _KNOWN = {
     "": re.compile("|".join(map(re.escape, _ROOT_FILES))),

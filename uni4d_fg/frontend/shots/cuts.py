@@ -34,6 +34,8 @@ _REST = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _BLUR_PX = 2.0
 _PURE = 0.08
 """Share of the other shot that cannot be seen."""
+_BLENDED = 2
+"""Frames beyond both ends of a dissolve that may still be a blend."""
 _MUCH_EXPLAINED = 0.5
 """Of the variance of a dissolve's frames: an orbit of two degrees a frame around dancers has 0.38."""
 
@@ -101,8 +103,10 @@ def _is_confirmed(
     fast orbit either. And its ends must not show one place, as those of a fast pan do, in whose blur corners are lost.
     """
     is_soft = cut.start > cut.stop
-    if is_soft and show_one_place(images[cut.stop - 1], images[cut.start], config.confirming_width):
-        return False
+    if is_soft:
+        first, last = max(0, cut.stop - 1 - _BLENDED), min(len(images) - 1, cut.start + _BLENDED)
+        if show_one_place(images[first], images[last], config.confirming_width):
+            return False
     reach = max(config.dissolve_spans) if is_soft else 2 * config.look_around
     around = range(max(0, cut.stop - reach), min(len(images), cut.start + reach))
     larger = config.model_copy(update={"width": config.confirming_width})
