@@ -13,7 +13,7 @@ from stream_samples import stream, stream_config
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Sequence
 from uni4d_fg.pipeline.stream import not_in_streams, stream_sequence
-from uni4d_fg.pipeline.warnings import scene_warnings
+from uni4d_fg.pipeline.warnings import focal_warnings, scene_warnings
 
 FRAMES, TAKEN = 10, 6
 CONFIG = stream_config("incremental.window=4", "incremental.nonrigid_lag=2", "incremental.nonrigid_window=5")
@@ -80,21 +80,21 @@ def test_a_stream_warns_of_what_a_batch_run_warns_of() -> None:
     given, poses = np.array([160.0, 160.0, 80.0, 60.0]), np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = [0.0, 0.5, 1.0]
     points = np.array([[0.0, 0.0, 5.0]])
-    assert scene_warnings(given, given, poses, points) == []
-    assert "moved by 159 %" in scene_warnings(given, given * [415 / 160, 1, 1, 1], poses, points)[0]
-    assert "no landmarks" in scene_warnings(given, given, poses, np.zeros((0, 3)))[0]
+    assert scene_warnings(given, poses, points) == []
+    assert "moved by 159 %" in focal_warnings(given, given[:2] * [415 / 160, 1])[0]
+    assert "no landmarks" in scene_warnings(given, poses, np.zeros((0, 3)))[0]
     covariance = np.zeros((3, 6, 6))
     path = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
     for part, expected in ((0.03, []), (0.06, ["camera positions are uncertain by 6 % of the path's length"])):
         covariance[1:, 3:, 3:] = np.diag([0.0, (part * path) ** 2, 0.0])
-        found = scene_warnings(given, given, poses, points, covariance)
+        found = scene_warnings(given, poses, points, covariance)
         assert [text.split(":")[0] for text in found] == expected
-    assert scene_warnings(given, given, poses, points, np.full((3, 6, 6), np.nan)) == []
+    assert scene_warnings(given, poses, points, np.full((3, 6, 6), np.nan)) == []
     still = np.tile(np.eye(4), (3, 1, 1))
-    assert "moves by only 0.00 %" in scene_warnings(given, given, still, points)[0]
-    assert "cue alone" in scene_warnings(given, given, still, points)[0]
+    assert "moves by only 0.00 %" in scene_warnings(given, still, points)[0]
+    assert "cue alone" in scene_warnings(given, still, points)[0]
     for parallax, origin in ((True, "from which all depth was found"), (False, "which was assumed")):
-        (little,) = scene_warnings(given, given, still, points, depth_parallax=parallax)
+        (little,) = scene_warnings(given, still, points, depth_parallax=parallax)
         assert f"moves by only 0.00 % of the scene's depth, {origin}" in little
 
 
@@ -102,7 +102,7 @@ def test_a_stream_warns_of_what_a_batch_run_warns_of() -> None:
 def test_a_camera_at_rest_determines_its_focal_length_if_it_turns(sigma_px: float, poor: bool) -> None:
     given, still = np.array([160.0, 160.0, 80.0, 60.0]), np.tile(np.eye(4), (3, 1, 1))
     covariance = np.diag([sigma_px**2, sigma_px**2, 0.0, 0.0])
-    found = scene_warnings(given, given, still, np.array([[0.0, 0.0, 5.0]]), None, covariance)
+    found = scene_warnings(given, still, np.array([[0.0, 0.0, 5.0]]), None, covariance)
     assert ["focal length is poorly determined" in text for text in found] == [poor]
 
 
@@ -119,7 +119,7 @@ def test_a_focal_length_that_is_known_badly_is_said_with_its_interval(
     points = np.array([[0.0, 0.0, 5.0]])
 
     def open_focal_warnings(covariance: np.ndarray | None, points: np.ndarray, *, doubted: bool = False) -> list[str]:
-        found = scene_warnings(intrinsics, intrinsics, poses, points, None, covariance, focal_was_doubted=doubted)
+        found = scene_warnings(intrinsics, poses, points, None, covariance, focal_was_doubted=doubted)
         return [text for text in found if "leaves the focal length open" in text]
 
     found = open_focal_warnings(covariance, points)

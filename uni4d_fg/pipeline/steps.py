@@ -214,7 +214,7 @@ def bundle_summary(
         facts.append(started_from_a_guess(sequence.intrinsics))
     # How far focal lengths moved, a lens or a zoom among what moved them, is known at the end of the run.
     warnings = scene_warnings(
-        None, arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
+        arrays["intrinsics"], arrays["world_T_cam"], landmarks, arrays["pose_covariance"],
         arrays["intrinsics_covariance"], focal_was_doubted=sequence.focal_sigma is not None,
         depth_parallax=sequence.depth_parallax,
     )  # fmt: skip

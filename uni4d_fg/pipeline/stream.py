@@ -233,7 +233,7 @@ def _stream(
     seconds["total"] = earlier + time.perf_counter() - began
     doubts = found_focal_warnings(sequence, reconstruction.intrinsics[:2], config.geometric_depth.usual_focal)
     doubts += scene_warnings(
-        None, reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
+        reconstruction.intrinsics, reconstruction.world_T_cam, reconstruction.landmarks,
         intrinsics_covariance=reconstruction.intrinsics_covariance, depth_parallax=sequence.depth_parallax,
     )  # fmt: skip
     facts = []

@@ -153,7 +153,6 @@ def found_focal_warnings(sequence: Sequence, focal_px: FloatArray, usual: tuple[
 
 
 def scene_warnings(
-    given_intrinsics: FloatArray | None,
     intrinsics: FloatArray,
     world_T_cam: FloatArray,
     landmarks: FloatArray,
@@ -166,9 +165,7 @@ def scene_warnings(
     """Return one sentence for everything that makes a static scene doubtful.
 
     Args:
-        given_intrinsics: (4,) fx, fy, cx, cy, px, that the solve started from; None where that was a guess, or where
-            whoever calls says how far the focal lengths moved.
-        intrinsics: (4,) that it ended with.
+        intrinsics: (4,) fx, fy, cx, cy, px, that the solve ended with.
         world_T_cam: (T, 4, 4) poses.
         landmarks: (N, 3) world, meters.
         pose_covariance: (T, 6, 6) of the poses' twists, translation last; NaN where it is not known.
@@ -176,7 +173,7 @@ def scene_warnings(
         focal_was_doubted: How well the focal lengths are known was said where they were found.
         depth_parallax: Whether the depth that was made from motion saw any; None for depth that was given.
     """
-    warnings = focal_warnings(given_intrinsics, intrinsics[:2])
+    warnings = list[str]()
     if not len(landmarks):
         return [*warnings, "there are no landmarks: the cameras rest on nothing that was measured"]
     first = world_T_cam[0, :3, 3]

@@ -27,7 +27,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.yaml_text import parse_yaml
 from uni4d_fg.errors import ConfigError, InputError
-from uni4d_fg.frontend.sequence.calibration import check_intrinsics, load_given_intrinsics, shared_intrinsics
+from uni4d_fg.frontend.sequence.calibration import check_intrinsics, load_intrinsics, shared_intrinsics
 from uni4d_fg.frontend.sequence.problems import SequenceProblem
 from uni4d_fg.frontend.sequence.resize import scale_intrinsics
 from uni4d_fg.geometry.lens import PINHOLE, Lens, LensModel
@@ -71,16 +71,20 @@ def load_calibration(path: Path, num_frames: int, size: tuple[int, int]) -> Cali
         InputError: If the file cannot be read, its model is not known here, it is of images of another shape, or it
             can be that of no camera with such images.
     """
+    found = _read(path, num_frames, size)
+    check_intrinsics(found.intrinsics, size, path)
+    return found
+
+
+def _read(path: Path, num_frames: int, size: tuple[int, int]) -> Calibration:
     suffix = path.suffix.lower()
     if suffix == ".npy":
-        return Calibration(load_given_intrinsics(path, num_frames, size))
+        return Calibration(load_intrinsics(path, num_frames, size))
     if suffix not in (".txt", ".json", ".yaml", ".yml"):
         raise SequenceProblem(path, "is no calibration that is known", "give .npy, .txt, .json, .yaml or .yml")
     matrix = _matrix(path) if suffix == ".txt" else None
     if matrix is not None:
-        shared = shared_intrinsics(matrix, path, num_frames, size)
-        check_intrinsics(shared, size, path)
-        return Calibration(shared)
+        return Calibration(shared_intrinsics(matrix, path, num_frames, size))
     read = {".txt": _colmap, ".json": _nerfstudio}.get(suffix, _yaml)
     try:
         found = read(path)
@@ -89,9 +93,7 @@ def load_calibration(path: Path, num_frames: int, size: tuple[int, int]) -> Cali
             raise SequenceProblem(
                 path, "has a focal length that is not positive, or a number that is not finite", "check it"
             )
-        fitted = _fitted(path, found, size)
-        check_intrinsics(fitted.intrinsics, size, path)
-        return fitted
+        return _fitted(path, found, size)
     except SequenceProblem:
         raise
     except InputError as error:  # of the lens

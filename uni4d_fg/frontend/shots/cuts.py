@@ -103,15 +103,15 @@ def _is_confirmed(
     fast orbit either. And its ends must not show one place, as those of a fast pan do, in whose blur corners are lost.
     """
     is_soft = cut.start > cut.stop
-    if is_soft:
-        first, last = max(0, cut.stop - 1 - _BLENDED), min(len(images) - 1, cut.start + _BLENDED)
-        if show_one_place(images[first], images[last], config.confirming_width):
-            return False
     reach = max(config.dissolve_spans) if is_soft else 2 * config.look_around
     around = range(max(0, cut.stop - reach), min(len(images), cut.start + reach))
     larger = config.model_copy(update={"width": config.confirming_width})
     search = _Search(_small_frames(images, around, larger, should_stop), larger)
     there = Cut(cut.stop - around.start, cut.start - around.start)
+    if is_soft:
+        first, last = max(0, there.stop - 1 - _BLENDED), min(len(around) - 1, there.start + _BLENDED)
+        if show_one_place(search.frames[first].gray, search.frames[last].gray):
+            return False
     found = any(c.stop <= there.start and there.stop <= c.start for c in search.run())
     return found or (is_soft and explained >= _MUCH_EXPLAINED and not search.is_outlived(there))
 

@@ -23,15 +23,9 @@ _LEAST = 12
 """Features that must agree."""
 
 
-def show_one_place(one: ImageArray, other: ImageArray, longer_side: int) -> bool:
-    """Tell whether two frames (H, W, 3) or (H, W), uint8, show one place, from about the same side.
-
-    Args:
-        one: The one.
-        other: The other.
-        longer_side: Of the images that are compared, px.
-    """
-    (here, described), (there, described_other) = (_features(image, longer_side) for image in (one, other))
+def show_one_place(one: ImageArray, other: ImageArray) -> bool:
+    """Tell whether two frames (H, W), uint8 gray, show one place, from about the same side."""
+    (here, described), (there, described_other) = _features(one), _features(other)
     if min(len(here), len(there)) < _LEAST:
         return False
     pairs = [
@@ -51,13 +45,10 @@ def show_one_place(one: ImageArray, other: ImageArray, longer_side: int) -> bool
     return int(np.count_nonzero(agrees)) >= _LEAST
 
 
-def _features(image: ImageArray, longer_side: int) -> tuple[np.ndarray, np.ndarray]:
+def _features(gray: ImageArray) -> tuple[np.ndarray, np.ndarray]:
     """Return where features (N, 2) are, and what they look like (N, 128)."""
-    gray = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, longer_side / max(gray.shape))
-    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     detector = cv2.SIFT_create(nfeatures=_FEATURES)  # type: ignore[attr-defined]
-    points, described = detector.detectAndCompute(small, None)
+    points, described = detector.detectAndCompute(gray, None)
     if described is None:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
     return np.array([point.pt for point in points]), described
