@@ -96,7 +96,7 @@ def fuse_depth(
         size or plain,
     )
     maps.try_matching()
-    told = ToldError(maps.is_interpolated)
+    told = ToldError(maps.is_interpolated, float(scene.get("focal_depth_error", 0.0)))
     remove_file(folder.confidence)
     with ExitStack() as files:
         writer = files.enter_context(write_depth(folder.depth, sequence.num_frames, sequence.image_size))

@@ -49,6 +49,8 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 STOPPED = "stopped; finished stages are kept, --resume continues from them"
 _MAX_DEPARTURE = 0.15
 """A median |log z - log cue| of moving points above this is warned of."""
+_STRETCHED = 0.03
+"""A mean relative error of depth above this, of the focal lengths alone, is told."""
 
 
 def given_poses(sequence: Video | Sequence, config: Config) -> FloatArray | None:
@@ -166,6 +168,7 @@ def scene_arrays(scene: StaticScene) -> dict[str, npt.NDArray[Any]]:
         "pose_covariance": scene.pose_covariance,
         "intrinsics_covariance": scene.intrinsics_covariance,
         "noise": scene.noise.array(),
+        "focal_depth_error": np.array(scene.focal_depth_error),
         **({} if scene.acceleration is None else scene.acceleration.arrays()),
     }
 
@@ -210,6 +213,12 @@ def bundle_summary(
         f"fx {fx:.1f} fy {fy:.1f} px, noise {noise.reprojection_sigma_px:.2f} px, "
         f"depth {100 * noise.depth_sigma:.1f} %"
     ]
+    stretched = float(arrays.get("focal_depth_error", 0.0))
+    if stretched > _STRETCHED:
+        facts.append(
+            f"depth hangs on the focal length, which is known to {100 * (sequence.focal_sigma or 0.0):.1f} %: "
+            f"so much more of it would change depth by {100 * stretched:.0f} % in the mean, scale apart"
+        )
     if sequence.intrinsics_are_guessed:
         facts.append(started_from_a_guess(sequence.intrinsics))
     # How far focal lengths moved, a lens or a zoom among what moved them, is known at the end of the run.

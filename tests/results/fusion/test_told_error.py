@@ -68,6 +68,8 @@ def test_without_static_pixels_no_error_is_told_and_without_landmarks_the_usual_
     assert told.mean() is None
     told.add(np.zeros(SHAPE, np.float32), np.ones(SHAPE, np.float32), everywhere, np.zeros((0, 2)), np.zeros(0))
     assert told.mean() == pytest.approx(0.0025)
+    told.focal_depth_error = 0.01
+    assert told.mean() == pytest.approx(np.hypot(0.0025, 0.01)), "what the focal length leaves open comes on top"
 
 
 def test_depth_interpolated_between_points_is_farther_off_where_it_is_as_sure() -> None:

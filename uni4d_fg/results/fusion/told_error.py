@@ -5,7 +5,8 @@ that see it, of the edges beside it, and where the cue bleeds of how far depth b
 mean of two estimates that err differently: the error that goes with such probabilities on scenes with truth, which
 counts for more, and how far landmarks are from the depth at pixels as sure as theirs. (Landmarks do not see the errors
 that they share with the depth, those of the cameras. They also lie on texture, where depth is best, and beside edges,
-where it is worst: comparing equally sure pixels takes this out, in part.)
+where it is worst: comparing equally sure pixels takes this out, in part.) What focal lengths that are not well known
+make of depth (:mod:`uni4d_fg.slam.stages.focal_depth_error`) is an error of its own.
 """
 
 from __future__ import annotations
@@ -82,6 +83,8 @@ class ToldError:
 
     from_motion: bool = False
     """The cue was interpolated between static points: as sure a pixel is farther off, and landmarks say nothing."""
+    focal_depth_error: float = 0.0
+    """Mean relative error that the cameras' focal lengths make, which all pixels and landmarks share."""
     pixels: FloatArray = field(default_factory=lambda: np.zeros(len(_BINS) + 1))
     """Number of static pixels by how sure they are."""
     expected: float = 0.0
@@ -130,7 +133,7 @@ class ToldError:
         found = [np.concatenate(off) if off else np.zeros(0) for off in self.off]
         everywhere = np.concatenate(found)
         if self.from_motion or len(everywhere) < _MIN_COMPARED:
-            return prior
+            return float(np.hypot(prior, self.focal_depth_error))
         typical = [float(np.median(off if len(off) >= _MIN_COMPARED else everywhere)) for off in found]
         at_landmarks = float(self.pixels @ np.array(typical)) / total
-        return float(prior**_PRIOR_SHARE * at_landmarks ** (1.0 - _PRIOR_SHARE))
+        return float(np.hypot(prior**_PRIOR_SHARE * at_landmarks ** (1.0 - _PRIOR_SHARE), self.focal_depth_error))

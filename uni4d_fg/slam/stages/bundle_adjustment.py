@@ -30,6 +30,7 @@ from uni4d_fg.optim.stage import Stage, StageRunner, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.stages.acceleration import AccelerationPrior, estimate_prior, starting_prior
 from uni4d_fg.slam.stages.energy import MAP, Energy
+from uni4d_fg.slam.stages.focal_depth_error import focal_depth_error
 from uni4d_fg.slam.stages.merging import FindFragments, MergedTracks, merge_tracks
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.stages.scene import Cameras, StaticNoise, StaticScene, unknown_covariances
@@ -179,7 +180,7 @@ def adjust_bundle(
     noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma, config.depth_correlation)
     solves: list[SolveSummary] = []
     merged: MergedTracks | None = None
-    covariances = unknown_covariances(len(start.world_T_cam))
+    covariances, stretched = unknown_covariances(len(start.world_T_cam)), 0.0
     rounds = 2 if energy.is_likelihood and config.measure_noise else 1
     motion = starting_prior(config.acceleration, timestamps, start.world_T_cam, landmarks)
 
@@ -205,6 +206,9 @@ def adjust_bundle(
         if index == rounds - 1 and energy.is_likelihood:
             known_to = None if freedom.intrinsics else focal_sigma
             covariances = _covariances(stage, state, observations, config, run, known_to)
+            if known_to:
+                joined = joined_by(run, stage, state)
+                stretched = focal_depth_error(joined.stage, joined.state, observations, known_to, hooks)
         del problem, stage  # as large as the observations, of which the next solve has others
         state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:
@@ -242,6 +246,7 @@ def adjust_bundle(
     scene = StaticScene(
         Cameras.of(state), state[LANDMARK][keep], track[keep], observations, noise, error,
         *covariances, solves, dropped, acceleration=motion if energy.is_likelihood else None,
+        focal_depth_error=stretched,
     )  # fmt: skip
     return scene if merged is None else merged.split(scene)
 

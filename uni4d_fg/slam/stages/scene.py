@@ -113,6 +113,8 @@ class StaticScene:
     """Number of tracks that were solved as part of another one's landmark; they have its position."""
     acceleration: AccelerationPrior | None = None
     """The prior on the cameras' acceleration that they were solved with; None without one."""
+    focal_depth_error: float = 0.0
+    """Mean relative error of depth, scale apart, that a standard deviation of focal lengths that were held makes."""
 
     def state(self) -> State:
         """Return the variables of the scene."""
