@@ -15,6 +15,7 @@ from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.shots.cuts import Cut, _Dissolve, _Search, find_cuts
 from uni4d_fg.frontend.shots.links import small_frame
+from uni4d_fg.frontend.shots.one_place import show_one_place
 from uni4d_fg.frontend.shots.survival import Span
 
 CONFIG = ShotsConfig()
@@ -183,6 +184,24 @@ def test_the_ends_of_a_dissolve_do_not_show_one_place(monkeypatch: pytest.Monkey
     monkeypatch.setattr(_Search, "is_outlived", lambda *_: False)
     larger = frames.repeat(2, axis=1).repeat(2, axis=2)
     assert cuts(larger) == (() if is_pan else (Cut(16, 24),))
+
+
+@pytest.mark.parametrize("is_one", [True, False])
+def test_what_is_small_and_stays_shows_one_place_beside_what_is_large_and_does_not(is_one: bool) -> None:
+    """As a room does through which people walk: halved, its pictures and books have too few features."""
+    rng = np.random.default_rng(0)
+
+    def room(of: int, people: int) -> ImageArray:
+        image, small = np.full((480, 640), 170, np.uint8), np.random.default_rng(of)
+        for k in range(12):  # 16 px of detail of one or two pixels each
+            y, x = 20 + 110 * (k // 3), 400 + 75 * (k % 3)
+            image[y : y + 16, x : x + 16] = cv2.GaussianBlur(small.integers(0, 255, (16, 16), np.uint8), (0, 0), 0.8)
+        large = np.random.default_rng(people).integers(0, 255, (48, 30), np.uint8)
+        image[:, 40:340] = cv2.resize(large, (300, 480), interpolation=cv2.INTER_CUBIC)
+        noise = rng.normal(0, 2.0, image.shape)
+        return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+    assert show_one_place(room(1, 5), room(1 if is_one else 2, 6)) is is_one
 
 
 def test_a_search_can_be_stopped() -> None:

@@ -109,8 +109,8 @@ def _is_confirmed(
     search = _Search(_small_frames(images, around, larger, should_stop), larger)
     there = Cut(cut.stop - around.start, cut.start - around.start)
     if is_soft:
-        first, last = max(0, there.stop - 1 - _BLENDED), min(len(around) - 1, there.start + _BLENDED)
-        if show_one_place(search.frames[first].gray, search.frames[last].gray):
+        first, last = max(0, cut.stop - 1 - _BLENDED), min(len(images) - 1, cut.start + _BLENDED)
+        if show_one_place(images[first], images[last]):
             return False
     found = any(c.stop <= there.start and there.stop <= c.start for c in search.run())
     return found or (is_soft and explained >= _MUCH_EXPLAINED and not search.is_outlived(there))

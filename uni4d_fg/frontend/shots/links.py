@@ -53,13 +53,20 @@ class Link:
     """Part of the corners that should be in the other image."""
 
 
+def small_gray(image: ImageArray, longer_side: int) -> ImageArray:
+    """Return an (H, W, 3) or (H, W) uint8 image as gray values (h, w) whose longer side is at most as given, px."""
+    gray = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, longer_side / max(gray.shape))
+    size = (max(16, round(gray.shape[1] * scale)), max(16, round(gray.shape[0] * scale)))
+    if size == gray.shape[::-1]:
+        return gray
+    smaller: ImageArray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+    return smaller
+
+
 def small_frame(image: ImageArray, config: ShotsConfig) -> SmallFrame:
     """Make an (H, W, 3) or (H, W) uint8 image small, with its corners."""
-    gray = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, config.width / max(gray.shape))
-    size = (max(16, round(gray.shape[1] * scale)), max(16, round(gray.shape[0] * scale)))
-    if size != gray.shape[::-1]:
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    gray = small_gray(image, config.width)
     values = gray.astype(np.float32)
     local = np.clip(128.0 + 50.0 * _relative(values, _LOCAL_PX), 0, 255).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(local, config.max_corners, 0.02, 4)
