@@ -72,6 +72,29 @@ def test_a_bad_pair_loses_and_an_unusual_focal_length_too(monkeypatch: pytest.Mo
     assert tried[3:] == [(pairs[1], 0.75), (pairs[1], 1.4)]
 
 
+@pytest.mark.parametrize("enough", [100, 15])
+def test_where_wide_pairs_fail_those_with_the_most_common_tracks_are_tried(
+    enough: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a camera turns fast, tracks are short: a wide baseline has dozens, and a trial takes a part of them."""
+    competition = competition_of(tracked(sideways(FRAMES), 4, points=60))
+    wide = [FramePair(3 * k, 3 * k + 3, 90.0, 55 - k) for k in range(5)]
+    near = [FramePair(3 * k, 3 * k + 1, 6.0, 600 - k) for k in range(6)]
+    tried = []
+
+    def trial(pair: FramePair, factor: float, part: Part) -> Hypothesis | None:
+        tried.append(pair)
+        return start([0.0] * 20, pair=pair) if pair.common >= enough else None
+
+    monkeypatch.setattr(competition, "pairs", lambda _: [*wide, *near])
+    monkeypatch.setattr(competition, "trial", trial)
+    assert competition.run()[0].pair == (near if enough == 100 else wide)[0]
+    count = CONFIG.geometric_depth.tried_pairs
+    expected = [*wide[:count], *near[:count]] if enough == 100 else wide[:count]
+    assert tried[: len(expected)] == expected
+    assert len(tried) == len(expected) + 2  # and the best of them with other focal lengths
+
+
 @pytest.mark.parametrize(
     ("guess", "first", "later"),
     [

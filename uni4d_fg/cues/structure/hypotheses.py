@@ -33,6 +33,8 @@ _ENOUGH = 0.2
 """Starts that explain less than this part of what is held out do not tell the noise of the tracks."""
 _OVERLAP = 0.5
 """Pairs that overlap by more than this part of their union are one start."""
+_MOST_FAIL = 0.5
+"""Where fewer than this part of the best pairs give a scene, those with the most common tracks are tried as well."""
 _SIDE = 0.25
 """Part of the picture's width that a side of it has."""
 
@@ -97,14 +99,19 @@ class Competition:
             Cancelled: If asked to stop.
         """
         settings = self.config.geometric_depth
-        chosen = distinct(self.pairs("majority"), settings.tried_pairs)
+        pairs = self.pairs("majority")
+        chosen = distinct(pairs, settings.tried_pairs)
         starts: list[tuple[FramePair, Part]] = [(pair, "majority") for pair in chosen]
         if self.outlier.any():
             starts += [(pair, "all") for pair in chosen[:1]]
         if self.outlier.mean() >= _MUCH:
             starts += [(pair, "minority") for pair in self.pairs("minority")[:1]]
         first, *factors = self.factors()
-        found = ranked([one for pair, part in starts if (one := self.trial(pair, first, part)) is not None])
+        found = [one for pair, part in starts if (one := self.trial(pair, first, part)) is not None]
+        if sum(one.tracks == "majority" for one in found) < _MOST_FAIL * len(chosen):
+            sturdy = [pair for pair in distinct(in_common(pairs), settings.tried_pairs) if pair not in chosen]
+            found += [one for pair in sturdy if (one := self.trial(pair, first, "majority")) is not None]
+        found = ranked(found)
         if found and self.free_focal:
             best = found[0]
             tried = [self.trial(best.pair, factor, best.tracks) for factor in factors]
@@ -243,6 +250,14 @@ def trial_frames(pair: FramePair, num_frames: int, steps: int, count: int) -> In
     # As many on either side as there are, the nearest first.
     left = min(len(before), max(room // 2, room - len(after)))
     return np.sort(np.concatenate([before[:left], between, after[: room - left]]))
+
+
+def in_common(pairs: list[FramePair]) -> list[FramePair]:
+    """Return pairs, those with the most common tracks first.
+
+    Where a camera turns fast or its images are blurred tracks are short: a wide baseline has too few of them.
+    """
+    return sorted(pairs, key=lambda pair: -pair.common)
 
 
 def distinct(pairs: list[FramePair], count: int) -> list[FramePair]:
