@@ -40,7 +40,7 @@ def check_sequence(sequence: Sequence) -> None:
             f"intrinsics {shown} are not fx, fy, cx, cy with positive focal lengths",
             "give (4,) pixels",
         )
-    if sequence.focal_sigma is None and sequence.depth_parallax is None:
+    if not sequence.is_self_calibrated:
         # What camera motion told is doubted where it is found, and no mistake of units.
         check_intrinsics(intrinsics, sequence.image_size, where)
     check_zoom(sequence.zoom, count, where)

@@ -107,7 +107,7 @@ def started_from_a_guess(guessed_intrinsics: FloatArray) -> str:
 def intrinsics_warnings(video: Video | Sequence) -> list[str]:
     """Return a sentence if given intrinsics are odd; those that camera motion told are doubted where it does."""
     given = video.intrinsics if isinstance(video, Video) else video.given_intrinsics
-    if given is None or video.focal_sigma is not None or video.depth_parallax is not None:
+    if given is None or video.is_self_calibrated:
         return []
     return given_doubts(given, video.image_size)
 
@@ -145,7 +145,7 @@ def found_focal_warnings(sequence: Sequence, focal_px: FloatArray, usual: tuple[
         usual: Range of focal lengths that cameras have, as parts of the longer image side.
     """
     moved = focal_warnings(sequence.given_intrinsics, focal_px)
-    if sequence.focal_sigma is not None or sequence.depth_parallax is not None:
+    if sequence.is_self_calibrated:
         return moved
     if sequence.intrinsics_are_guessed:
         return unusual_focal(float(focal_px.mean()), sequence.image_size, usual)

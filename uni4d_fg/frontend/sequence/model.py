@@ -78,8 +78,20 @@ class Content:
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
 
+class _SelfCalibration:
+    """What :class:`Video` and :class:`Sequence` say of cameras that were found from their motion."""
+
+    depth_parallax: bool | None
+    focal_sigma: float | None
+
+    @property
+    def is_self_calibrated(self) -> bool:
+        """Whether camera motion told the intrinsics or, with them, the depth: they are doubted where they are found."""
+        return self.focal_sigma is not None or self.depth_parallax is not None
+
+
 @dataclass(frozen=True)
-class Video:
+class Video(_SelfCalibration):
     """What came in: frames, and the cues that came with them; :mod:`uni4d_fg.cues` makes those that are missing.
 
     Conventions as in :class:`Sequence`.
@@ -126,7 +138,7 @@ class Video:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class Sequence(_SelfCalibration):
     """One video with all its cues.
 
     Conventions: pixel centers at integers; depth is z-depth in meters, NaN where missing (readers turn
