@@ -21,6 +21,8 @@ _BLURS = ((0.0, False), (0.1, False), (0.2, False), (0.1, True))
 """Lengths of blur, part of the longer side, and whether it is vertical."""
 _COARSE_LOCAL_PX = 10.0
 _BORDER = 3
+_SCALES = (0.5, 2.0)
+"""Of a similarity between two frames of one scene; beyond these the matches are wrong."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +106,14 @@ def link(source: SmallFrame, target: SmallFrame, guess: FloatArray, config: Shot
         fitted, _ = cv2.estimateAffinePartial2D(
             points[kept], moved[kept], method=cv2.RANSAC, ransacReprojThreshold=2.0, maxIters=200
         )
-        if fitted is not None and 0.5 < np.hypot(fitted[0, 0], fitted[0, 1]) < 2.0:
+        if fitted is not None and has_plausible_scale(fitted):
             motion = fitted
     return Link(found, motion, overlap)
+
+
+def has_plausible_scale(similarity: np.ndarray) -> bool:
+    """Tell whether a similarity (2, 3) between two frames scales by what the size of one scene may change by."""
+    return bool(_SCALES[0] < np.hypot(similarity[0, 0], similarity[0, 1]) < _SCALES[1])
 
 
 def pan_between(source: SmallFrame, target: SmallFrame, min_overlap: float) -> tuple[float, FloatArray]:

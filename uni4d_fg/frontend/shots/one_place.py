@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import ImageArray
-from uni4d_fg.frontend.shots.links import small_gray
+from uni4d_fg.frontend.shots.links import has_plausible_scale, small_gray
 
 _WIDTH = 640
 """Longer side of the images that are compared, at most, px: half as large, what is far has too few features."""
@@ -20,7 +20,6 @@ _FEATURES = 800
 _DISTINCT = 0.8
 """A feature is matched whose best match is nearer than this part of the distance of the second."""
 _ERROR_PX = 3.0
-_SCALES = (0.5, 2.0)
 _MOST_ROLL = np.radians(45.0)
 """Shots of one place that is seen upside down are two."""
 _LEAST = 12
@@ -42,7 +41,7 @@ def show_one_place(one: ImageArray, other: ImageArray) -> bool:
     source = here[[pair.queryIdx for pair in pairs]]
     target = there[[pair.trainIdx for pair in pairs]]
     moved, agrees = cv2.estimateAffinePartial2D(source, target, method=cv2.RANSAC, ransacReprojThreshold=_ERROR_PX)
-    if moved is None or not _SCALES[0] < np.hypot(moved[0, 0], moved[0, 1]) < _SCALES[1]:
+    if moved is None or not has_plausible_scale(moved):
         return False
     if abs(np.arctan2(moved[1, 0], moved[0, 0])) > _MOST_ROLL:
         return False
