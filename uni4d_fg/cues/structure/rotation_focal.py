@@ -16,6 +16,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.structure.first_pair import common_pixels
+from uni4d_fg.cues.structure.self_calibration import AGREED, MIN_VOTES
 from uni4d_fg.cues.structure.two_view import left_by_rotations, multiples
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -24,9 +25,6 @@ _FOCALS = np.geomspace(0.35, 5.0, 68)
 _SAMPLED_FRAMES = 12
 _CLEAR = 1.5
 """At the shortest and the longest focal length, so many times what is left at the best must be left."""
-_MIN_VOTES = 8
-_AGREED = 1.35
-"""Pairs agree if the upper quartile of their votes is at most this many times the lower one."""
 _LEAST_SIGMA = 0.01
 
 
@@ -67,10 +65,10 @@ def focal_of_rotations(
     best = log_left.argmin(axis=1)
     clear = np.minimum(log_left[:, 0], log_left[:, -1]) - log_left.min(axis=1) > np.log(_CLEAR)
     votes = np.log(_FOCALS[best[clear]])
-    if len(votes) < _MIN_VOTES:
+    if len(votes) < MIN_VOTES:
         return None
     lower, upper = np.quantile(votes, [0.25, 0.75])
-    if upper - lower > np.log(_AGREED):
+    if upper - lower > np.log(AGREED):
         return None
     focal = float(np.exp(_least(np.log(_FOCALS), log_left[clear].mean(axis=0))) * longer)
     return RotationFocal(focal, max(0.5 * float(upper - lower), _LEAST_SIGMA))

@@ -18,8 +18,9 @@ from uni4d_fg.arrays import FloatArray
 
 _FOCALS = np.geomspace(0.35, 2.5, 60)
 """Focal lengths that are tried, as parts of the longer side of the image: steps of 3.4 %."""
-_MIN_VOTES = 8
-_AGREED = 1.35
+MIN_VOTES = 8
+"""Pairs that tell a focal length, at least."""
+AGREED = 1.35
 """Pairs agree if the upper quartile of their votes is at most this many times the lower one."""
 
 
@@ -52,7 +53,7 @@ def focal_of_pairs(
     unlike = 1.0 - values[..., 1] / np.maximum(values[..., 0], np.finfo(float).tiny)
     vote = np.argmin(unlike, axis=0)
     told = vote[(vote > 0) & (vote < len(focal) - 1)]  # at either end it is beyond, or not told at all
-    if len(told) < _MIN_VOTES:
+    if len(told) < MIN_VOTES:
         return None
     low, middle, high = np.quantile(focal[told], [0.25, 0.5, 0.75])
-    return FocalGuess(float(middle), bool(high <= _AGREED * low))
+    return FocalGuess(float(middle), bool(high <= AGREED * low))
