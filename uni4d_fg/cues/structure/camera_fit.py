@@ -24,6 +24,7 @@ from uni4d_fg.optim.stage import Stage, run_stage
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.problems import RealPixels, lens_problem, zoom_problem
+from uni4d_fg.slam.lens.track_energy import track_energies
 from uni4d_fg.slam.stages.energy import MAP
 from uni4d_fg.slam.stages.observations import Observations
 from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames
@@ -33,10 +34,8 @@ _DAMPING = 1e-6
 _SETTLING = 2
 """So many times more steps are taken without a zoom before the probe: what they leave is 1.5 % of the energy after as
 many, 0.9 % after twice as many."""
-_LOST = 50.0
-"""Errors, in sigmas, are cut here: what a camera does not explain counts as much."""
 _MISSED = 3.0
-"""The same, where all tracks count."""
+"""Errors, in sigmas, are cut here where all tracks count."""
 _MAX_FRAMES = 120
 """Frames that cameras are compared on, at most: a focal length per frame makes the system of the cameras dense."""
 _SIGHTINGS = 4
@@ -88,11 +87,9 @@ class TrackJudge:
         scene = fitted.scene.seeing(fitted.camera.ideal_observations(self.real))
         seen = scene.observations
         size = fitted.camera.ideal_weight(seen.uv, seen.frame)
-        error = np.minimum(scene.errors() * np.sqrt(size) / self.sigma_px, _LOST)
-        row = np.searchsorted(tracks, seen.track)
-        count = np.bincount(row, minlength=len(tracks))
+        error = scene.errors() * np.sqrt(size) / self.sigma_px
         known = np.isin(tracks, seen.track[np.isfinite(scene.position[scene.row, 0])])
-        energy = np.bincount(row, np.log1p(error**2), len(tracks)) / np.maximum(count, 1)
+        energy = track_energies(error, np.searchsorted(tracks, seen.track), len(tracks))
         return np.where(known, energy, np.nan)
 
     def anew(self, fitted: Fitted) -> Fitted:

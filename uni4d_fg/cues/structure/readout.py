@@ -18,6 +18,7 @@ from uni4d_fg.cues.structure.camera_fit import part_of
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.slam.lens.readout_search import BELIEVED, FIRST, least_readout
 from uni4d_fg.slam.lens.rolling_shutter import Axis, Readout
+from uni4d_fg.slam.lens.track_energy import track_energies
 from uni4d_fg.slam.stages.observations import Observations
 
 _OBSERVATIONS = 8000
@@ -25,8 +26,6 @@ _OBSERVATIONS = 8000
 _AXES: tuple[Axis, ...] = ("rows", "columns")
 _SOLVED = 1e-4
 """Relative decrease at which bundle adjustment with a readout ends: what readouts differ by is a hundred times that."""
-_LOST = 50.0
-"""Errors, in sigmas, are cut here."""
 
 
 def find_readout(scene: GrowingScene, observations: Observations, image_size: tuple[int, int]) -> Readout | None:
@@ -149,8 +148,6 @@ class _Trials:
             scene.measure_noise()
             scene.adjust(_SOLVED)
             scene.triangulate_all()
-            error = np.minimum(scene.errors() / self.scene.noise_px, _LOST)
-            count = np.maximum(np.bincount(scene.row, minlength=scene.num_tracks), 1)
-            energy = np.bincount(scene.row, np.log1p(error**2), scene.num_tracks) / count
+            energy = track_energies(scene.errors() / self.scene.noise_px, scene.row, scene.num_tracks)
             self.known[readout] = np.where(np.isfinite(scene.position[:, 0]), energy, np.nan)
         return self.known[readout]

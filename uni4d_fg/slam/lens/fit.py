@@ -22,6 +22,7 @@ from uni4d_fg.optim.stage import Stage, StageRunner
 from uni4d_fg.optim.summary import SolveSummary, Termination
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.problems import RealPixels, lens_family, lens_problem
+from uni4d_fg.slam.lens.track_energy import LOST_ENERGY, robust_energies, track_energies
 from uni4d_fg.slam.stages.bundle_adjustment import (
     Freedom,
     bundle_adjustment_problem,
@@ -32,9 +33,6 @@ from uni4d_fg.slam.stages.observations import observations_of
 from uni4d_fg.slam.stages.scene import Cameras, StaticScene
 from uni4d_fg.slam.stages.static_scene import StaticSceneSolver
 from uni4d_fg.slam.stages.structure import structure_problem
-
-_FAR = 50.0
-"""Whitened error, squared and summed in a logarithm, beyond which a held-out observation counts as lost."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +122,9 @@ class LensFit:
         _, row = seen.rows()
         error = _errors(self.tracks, seen.track, seen.frame, fit, fit.scene.landmarks[row])
         sigma = self.config.bundle_adjustment.reprojection_sigma_px
-        kept = np.log1p(np.minimum(error / sigma, _FAR) ** 2).sum()
+        kept = robust_energies(error / sigma).sum()
         lost = int((self.tracks.weight > 0).sum()) - len(seen)
-        return float(kept + lost * np.log1p(_FAR**2))
+        return float(kept + lost * LOST_ENERGY)
 
     def refine(self, start: StaticScene, lens: Lens, model: LensModel, rounds: int = 1) -> FittedLens:
         """Solve everything together; between rounds stages 1 and 2 judge outliers anew.
@@ -252,8 +250,7 @@ class HeldOut:
         problem = structure_problem(state, seen, fit.scene.noise, ba).fix(LOG_SCALE)
         state, _ = self.run(Stage("structure", problem, ba.structure_solver, part="held out"), state, self.hooks)
         error = _errors(self.tracks, seen.track, seen.frame, fit, state[LANDMARK][row])
-        energy = np.log1p(np.minimum(error / ba.reprojection_sigma_px, _FAR) ** 2)
-        out[tracks] = np.bincount(row, energy) / np.bincount(row)
+        out[tracks] = track_energies(error / ba.reprojection_sigma_px, row, len(tracks))
         return out
 
 
