@@ -30,9 +30,8 @@ class CameraModel:
     @classmethod
     def of_log_zoom(cls, intrinsics: FloatArray, log_zoom: FloatArray) -> CameraModel:
         """Return a pinhole whose focal lengths are ``exp(log_zoom)`` (T,) times those of intrinsics (4,), px."""
-        longest = intrinsics.copy()
-        longest[:2] *= np.exp(log_zoom.max())
-        return cls(longest, zoom=np.exp(log_zoom - log_zoom.max()))
+        longest, log_zoom = of_longest_focal(intrinsics, log_zoom)
+        return cls(longest, zoom=np.exp(log_zoom))
 
     @property
     def is_plain(self) -> bool:
@@ -128,3 +127,15 @@ class CameraModel:
         """Return what :meth:`to_array` returned of a camera with intrinsics (4,)."""
         lens = Lens.of(list(PARAMETERS)[int(array[0])], array[1:5])
         return cls(intrinsics, lens, array[5:] if len(array) > 5 else None)
+
+
+def of_longest_focal(intrinsics: FloatArray, log_zoom: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the intrinsics (4,), px, of the frame with the longest focal length, and the zoom (T,) relative to it.
+
+    Args:
+        intrinsics: (4,) px.
+        log_zoom: (T,) log focal length of each frame over theirs.
+    """
+    longest, most = intrinsics.copy(), float(log_zoom.max())
+    longest[:2] *= np.exp(most)
+    return longest, log_zoom - most

@@ -15,7 +15,7 @@ from uni4d_fg.geometry.lens import PINHOLE
 from uni4d_fg.optim.marginals import camera_marginals
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.stage import Stage
-from uni4d_fg.slam.lens.camera_model import CameraModel
+from uni4d_fg.slam.lens.camera_model import CameraModel, of_longest_focal
 from uni4d_fg.slam.lens.fit import FittedLens, HeldOut, LensFit
 from uni4d_fg.slam.lens.problems import RealPixels, zoom_problem
 from uni4d_fg.slam.stages.bundle_adjustment import Freedom, bundle_adjustment_problem
@@ -75,11 +75,9 @@ class ZoomFit:
         tracks = CameraModel(start.intrinsics, zoom=np.exp(start.zoom)).ideal_labelled(self.more_tracks)
         fit = replace(self.fit, tracks=tracks)
         left = replace(self, fit=fit).solve(fit.scene(PINHOLE, start.intrinsics))
-        zoom, intrinsics = start.zoom + left.zoom, left.intrinsics.copy()
-        longest = float(zoom.max())
-        intrinsics[:2] *= np.exp(longest)
+        intrinsics, zoom = of_longest_focal(left.intrinsics, start.zoom + left.zoom)
         cameras = replace(left.cameras, intrinsics=intrinsics)
-        return replace(left, zoom=zoom - longest, intrinsics=intrinsics, evidence=start.evidence, cameras=cameras)
+        return replace(left, zoom=zoom, intrinsics=intrinsics, evidence=start.evidence, cameras=cameras)
 
     def solve(self, scene: StaticScene, options: Mapping[str, float] | None = None, part: str = "zoom") -> FittedZoom:
         """Solve everything together, from a camera that does not zoom.
@@ -104,12 +102,11 @@ class ZoomFit:
         gain = after.initial_energy - after.final_energy
         marginals = camera_marginals(stage.problem, state, solver)
         sigma = None if marginals is None else np.sqrt(marginals.blocks(ZOOM, len(self.frames))[:, 0, 0])
-        zoom, intrinsics = state[ZOOM][:, 0], state[INTRINSICS][0].copy()
-        focal = np.nan if marginals is None else np.sqrt(marginals.blocks(INTRINSICS, 1)[0, 0, 0]) / intrinsics[0]
-        longest = float(zoom.max())
-        intrinsics[:2] *= np.exp(longest)
+        first = state[INTRINSICS][0]
+        focal = np.nan if marginals is None else np.sqrt(marginals.blocks(INTRINSICS, 1)[0, 0, 0]) / first[0]
+        intrinsics, zoom = of_longest_focal(first, state[ZOOM][:, 0])
         cameras = Cameras(state[POSE], intrinsics, state[LOG_SCALE][:, 0])
-        return FittedZoom(zoom - longest, intrinsics, gain / max(before, 1e-300), sigma, float(focal), cameras)
+        return FittedZoom(zoom, intrinsics, gain / max(before, 1e-300), sigma, float(focal), cameras)
 
     def agreement(self, found: FittedZoom, scene: StaticScene) -> float:
         """Return the part of the tracks that a zoom explains better than the camera that does not zoom.
