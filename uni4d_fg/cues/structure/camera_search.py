@@ -109,8 +109,10 @@ def find_camera(
             best = lens
     if starts:
         zoom = find_zoom(starts, plain, judge, scene, real, config, grown)
-        if zoom is not None and (settings.zoom == "on" or may_be_zoom(zoom, best, judge, config)):
-            if settings.zoom == "on" or explains_most(zoom, plain, judge, config):
+        if zoom is not None and settings.zoom == "on":
+            best = zoom
+        elif zoom is not None and may_be_zoom(zoom, best, judge, config):
+            if explains_most(zoom, plain, judge, config):
                 best = zoom
             else:
                 open_focal = focal_range(zoom)
