@@ -8,6 +8,8 @@
 
 namespace uni4d_fg {
 
+constexpr float kFarthest = 60.0F;  // exponent beyond which what is compared is equally unlike: callers cut it here
+
 /// exp(-x) for x in [0, 87], to 2e-7 of itself, without a branch or a call.
 UNI4D_FG_INLINE float exp_minus(float x) {
   const float t = -1.44269504F * x;                            // exp(-x) = 2^t

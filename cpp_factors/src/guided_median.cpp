@@ -11,8 +11,6 @@ namespace uni4d_fg {
 
 namespace {
 
-constexpr float kFarthest = 60.0F;  // exponent beyond which pixels are equally unlike
-
 UNI4D_FG_WIDE_CLONES void weigh(const float* __restrict unlike, const float* __restrict weights, int count,
                                 float* __restrict out) {
   for (int k = 0; k < count; ++k) out[k] = weights[k] * exp_minus(unlike[k] < kFarthest ? unlike[k] : kFarthest);

@@ -15,8 +15,7 @@ namespace {
 
 constexpr int kGrainRows = 16;
 constexpr int kChunk = 128;
-constexpr int kTaps = 3;             // pixels of the map that are looked at, in each direction
-constexpr float kFarthest = 60.0F;   // exponent beyond which colors are equally unlike
+constexpr int kTaps = 3;  // pixels of the map that are looked at, in each direction
 constexpr float kLeastWeight = 1e-12F;
 
 /// Where the pixels of one side fall in the map: for each of the taps, which pixel that is and how much it weighs.
