@@ -311,6 +311,9 @@ FOREIGN = (
 def test_files_of_others_in_a_run_stay(run_folder: Path, tmp_path: Path) -> None:
     run, elsewhere = Path(shutil.copytree(run_folder, tmp_path / "run")), tmp_path / "elsewhere"
     assert judged_verb("export", run, "--to", "tum")[0] == 0
+    code, _, err = judged_verb("export", run, "--to", "tum")
+    assert code == 6
+    assert "replace it with --overwrite or choose another --out" in err
     elsewhere.mkdir()
     (elsewhere / "static.ply").write_text("mine")
     shutil.rmtree(run / "clouds")
@@ -409,7 +412,9 @@ def test_two_processes_do_not_write_into_one_folder(tmp_path: Path, sequence_fol
         for verb in ("reconstruct", "stream"):
             code, _, err = judged_verb(verb, sequence_folder, "--out", tmp_path / "run")
             assert code == 6
-            assert "another process is writing there" in err
+            assert "another process is writing there; wait for it to end or choose another --out" in err
+        with pytest.raises(OutputError, match=r"process .* or choose another folder$"), run_lock(tmp_path / "run"):
+            pass
         process.kill()
     with run_lock(tmp_path / "run"), run_lock(tmp_path / "run"):
         pass
@@ -428,5 +433,7 @@ def test_a_lock_is_not_shared_with_another_thread(tmp_path: Path) -> None:
             pass
 
     with run_lock(tmp_path), ThreadPoolExecutor(1) as pool:
-        assert isinstance(judged(pool.submit(enter).result), OutputError)
+        refused = judged(pool.submit(enter).result)
+        assert isinstance(refused, OutputError)
+        assert str(refused).endswith("another thread is writing there; wait for it to end or choose another folder")
     enter()

@@ -16,7 +16,7 @@ from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.reconstruction import class_list
 from uni4d_fg.cli.runs import SequenceInput
 from uni4d_fg.errors import Cancelled, OutputError
-from uni4d_fg.results.run_contents import is_free, is_run, mark_run, remove_leftovers, run_lock
+from uni4d_fg.results.run_contents import COMMAND_LINE, is_free, is_run, mark_run, remove_leftovers, run_lock
 
 
 class WrittenLayout(str, Enum):
@@ -77,7 +77,7 @@ def cues(
     work = out.with_name(f"{out.name}-unfinished")
     if not (is_free(work) or is_run(work)):
         raise OutputError(f"{work}: is needed for what is unfinished, but holds something else; choose another --out")
-    with run_lock(work), Interruption() as stopped, progress_reporter(quiet) as reporter:
+    with run_lock(work, COMMAND_LINE), Interruption() as stopped, progress_reporter(quiet) as reporter:
         mark_run(work)
         remove_leftovers(work)
         try:

@@ -16,7 +16,7 @@ from uni4d_fg.pipeline import RunSummary
 from uni4d_fg.results.evaluate.points import PointMetrics
 from uni4d_fg.results.evaluate.run import EvaluationReport
 from uni4d_fg.results.io import load_reconstruction
-from uni4d_fg.results.run_contents import is_free, is_run, remove_results, run_lock
+from uni4d_fg.results.run_contents import COMMAND_LINE, is_free, is_run, remove_results, run_lock
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import Reconstruction
 
@@ -32,7 +32,7 @@ def demo_folder(folder: Path, *, resume: bool) -> Iterator[None]:
         OutputError: If the folder holds anything but an earlier demo, or another process writes there.
     """
     prepare_demo_folder(folder)
-    with run_lock(folder):
+    with run_lock(folder, COMMAND_LINE):
         if not resume:
             remove_results(folder)
         yield

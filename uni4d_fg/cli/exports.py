@@ -56,6 +56,7 @@ def export(
     from uni4d_fg.frontend.sequence.model import Sequence
     from uni4d_fg.results.export import ExportOptions, export_run
     from uni4d_fg.results.run import Run
+    from uni4d_fg.results.run_contents import COMMAND_LINE
     from uni4d_fg.results.shot_list import refuse_split
 
     refuse_split(run)
@@ -76,7 +77,7 @@ def export(
     with progress_reporter(quiet or json) as reporter, Interruption() as stop:
         reports = export_run(
             Run(run, open_sequence), [choice.value for choice in to], out, choices,
-            overwrite=overwrite, reporter=reporter, should_stop=stop,
+            overwrite=overwrite, reporter=reporter, should_stop=stop, remedies=COMMAND_LINE,
         )  # fmt: skip
     if json:
         print_json({r.format: {"folder": r.folder, **r.figures, "warnings": r.warnings} for r in reports})

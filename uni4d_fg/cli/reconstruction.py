@@ -138,7 +138,7 @@ def reconstruct(
             drop_intermediate(folder / CUE_FOLDER)
         return summary, sequence
 
-    with run_lock(run):
+    with run_lock(run, COMMAND_LINE):
         prepare_run_folder(run, source, resume=resume, overwrite=overwrite)
         looked_for = settings.shots.split == "auto" and not is_measured
         cuts = shots.cuts_of(opened.video, settings.shots) if looked_for else ()

@@ -17,7 +17,7 @@ from uni4d_fg.errors import Cancelled, InputError, Uni4dFgError
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
 from uni4d_fg.frontend.shots.cuts import Cut, find_cuts
-from uni4d_fg.results.run_contents import run_lock
+from uni4d_fg.results.run_contents import COMMAND_LINE, run_lock
 from uni4d_fg.results.shot_list import Shot, shot_folder, write_shots
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def reconstruct_shots(
             continue
         folder, first = run / shot.folder, (shot.start - source.start) // source.stride
         try:
-            with run_lock(folder):
+            with run_lock(folder, COMMAND_LINE):
                 part = replace(source, start=shot.start, stop=shot.stop)
                 prepare_run_folder(folder, part, resume=resume, overwrite=overwrite)
                 frames = select_frames(video, FrameSelection(first, first + shot.num_frames))

@@ -17,7 +17,7 @@ from uni4d_fg.cli.progress import progress_reporter
 from uni4d_fg.cli.runs import SequenceInput, prepare_run_folder
 from uni4d_fg.errors import Cancelled, ConfigError, InputError
 from uni4d_fg.reading import resolved
-from uni4d_fg.results.run_contents import run_lock
+from uni4d_fg.results.run_contents import COMMAND_LINE, run_lock
 
 if TYPE_CHECKING:
     from uni4d_fg.progress import Reporter
@@ -78,7 +78,7 @@ def stream(
     # What is wrong is said before an earlier run is replaced.
     check_stream(sequence, settings)
     read_measurements(files, sequence.timestamps, settings.measurements)
-    with run_lock(run), Interruption() as interrupted, progress_reporter(quiet) as reporter:
+    with run_lock(run, COMMAND_LINE), Interruption() as interrupted, progress_reporter(quiet) as reporter:
         prepare_run_folder(run, source, resume=resume, overwrite=overwrite, whole=True)
         reporter.begin("stream", sequence.num_frames)
         try:

@@ -206,10 +206,14 @@ _guard = threading.Lock()
 
 
 @contextmanager
-def run_lock(root: Path) -> Iterator[None]:
+def run_lock(root: Path, remedies: Remedies = PYTHON) -> Iterator[None]:
     """Keep other processes and threads from writing into the folder of a run; it is made if absent.
 
     The lock goes with the process, however that ends. Within one thread it may be taken again.
+
+    Args:
+        root: Of the run.
+        remedies: How the caller spells what to do.
 
     Raises:
         OutputError: If another process or thread writes there, or the folder cannot be made.
@@ -218,14 +222,14 @@ def run_lock(root: Path) -> Iterator[None]:
     with _guard:
         owner = _held.get(name)
         if owner not in (None, me):
-            raise OutputError(f"{root}: another thread is writing there; wait for it to end or choose another --out")
+            raise OutputError(f"{root}: another thread is writing there; wait for it to end or {remedies.elsewhere}")
         if owner is None:
             _held[name] = me
     if owner is not None:
         yield
         return
     try:
-        with _locked_folder(root):
+        with _locked_folder(root, remedies):
             yield
     finally:
         with _guard:
@@ -233,7 +237,7 @@ def run_lock(root: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _locked_folder(root: Path) -> Iterator[None]:
+def _locked_folder(root: Path, remedies: Remedies) -> Iterator[None]:
     try:
         root.mkdir(parents=True, exist_ok=True)
         descriptor = None if fcntl is None else os.open(root, os.O_RDONLY)
@@ -247,7 +251,7 @@ def _locked_folder(root: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise OutputError(
-                f"{root}: another process is writing there; wait for it to end or choose another --out"
+                f"{root}: another process is writing there; wait for it to end or {remedies.elsewhere}"
             ) from error
         except OSError:
             pass  # a file system without locks

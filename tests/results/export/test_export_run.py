@@ -110,6 +110,12 @@ def test_an_empty_folder_is_filled(source: Run, tmp_path: Path) -> None:
     assert names(tmp_path / "tum") == ["export.json", "trajectory.txt"]
 
 
+def test_a_folder_that_is_in_the_way_is_told_in_words_of_python(source: Run, tmp_path: Path) -> None:
+    export_run(source, ["tum"], tmp_path)
+    with pytest.raises(OutputError, match=r"replace it with overwrite=True or choose another folder$"):
+        export_run(source, ["tum"], tmp_path)
+
+
 def test_overwriting_leaves_nothing_of_the_old(source: Run, tmp_path: Path) -> None:
     export_run(source, ["colmap"], tmp_path)
     export_run(source, ["colmap"], tmp_path, ExportOptions(text=False), overwrite=True)

@@ -14,7 +14,7 @@ from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.results.export.model import ExportJob, ExportOptions, ExportReport
 from uni4d_fg.results.export.registry import exporter
 from uni4d_fg.results.run import Run
-from uni4d_fg.results.run_contents import EXPORT_MARKER, export_files, foreign_files, is_export
+from uni4d_fg.results.run_contents import EXPORT_MARKER, PYTHON, Remedies, export_files, foreign_files, is_export
 from uni4d_fg.results.shot_list import refuse_split
 from uni4d_fg.results.undistort import undistorted
 
@@ -28,6 +28,7 @@ def export_run(
     overwrite: bool = False,
     reporter: Reporter | None = None,
     should_stop: Callable[[], bool] | None = None,
+    remedies: Remedies = PYTHON,
 ) -> list[ExportReport]:
     """Write a run in the formats of other programs.
 
@@ -40,6 +41,7 @@ def export_run(
         overwrite: Replace earlier exports. A folder that is no export is never touched.
         reporter: Progress.
         should_stop: Polled every frame; True ends with :class:`Cancelled`, finished formats kept.
+        remedies: How the caller spells what to do about a folder that is in the way.
 
     Returns:
         One report per format, in the order asked for.
@@ -58,7 +60,7 @@ def export_run(
     root = run.folder.exports if out is None else Path(out)
     for name, one in chosen.items():
         one.require()
-        _check_target(root / name, overwrite)
+        _check_target(root / name, overwrite, remedies)
         if one.needs_images:
             run.need_sequence()
     reporter = reporter or SilentReporter()
@@ -95,17 +97,17 @@ def _export(
     return ExportReport(name, target, tuple(job.facts), job.figures, tuple(job.warnings))
 
 
-def _check_target(target: Path, overwrite: bool) -> None:
+def _check_target(target: Path, overwrite: bool, remedies: Remedies) -> None:
     """Raise OutputError if ``target`` is in the way."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     if not is_export(target):
-        raise OutputError(f"{target}: exists and is no export; choose another --out")
+        raise OutputError(f"{target}: exists and is no export; {remedies.elsewhere}")
     if not overwrite:
-        raise OutputError(f"{target}: exists already; replace it with --overwrite or choose another --out")
+        raise OutputError(f"{target}: exists already; replace it with {remedies.overwrite} or {remedies.elsewhere}")
     foreign = foreign_files(target)
     if foreign:
-        raise OutputError(f"{target}: holds {foreign[0]}, which is not of the export; move it or choose another --out")
+        raise OutputError(f"{target}: holds {foreign[0]}, which is not of the export; move it or {remedies.elsewhere}")
 
 
 @contextmanager
