@@ -15,9 +15,12 @@ import pytest
 import yaml
 
 from uni4d_fg.cli import demonstration, main, reconstruction
+from uni4d_fg.cli.options import LayoutChoice
+from uni4d_fg.cli.runs import SequenceInput
 from uni4d_fg.config.load import load_config
-from uni4d_fg.errors import Cancelled, SolverError
+from uni4d_fg.errors import Cancelled, InputError, SolverError
 from uni4d_fg.files import load_npz, save_npy
+from uni4d_fg.frontend.sequence.calibration import shared_intrinsics
 from uni4d_fg.frontend.synthetic import SyntheticSceneConfig
 from uni4d_fg.frontend.tracks.io import load_tracks
 
@@ -294,6 +297,25 @@ def test_what_cannot_be_asked_of_a_video_costs_no_run(
     assert (finished / "summary.json").read_bytes() == kept
     assert cli(verb, scene, "--out", tmp_path / "run", *words)[0] == code
     assert not (tmp_path / "run" / "run.json").exists()  # the corrected command may write there
+
+
+def test_intrinsics_that_are_replaced_are_not_read(scene: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(scene, tmp_path / "room"))
+    (folder / "K.npy").rename(tmp_path / "known.npy")
+    (folder / "K.npy").write_bytes(b"broken")
+
+    def source(intrinsics: Path | None) -> SequenceInput:
+        given = None if intrinsics is None else str(intrinsics)
+        return SequenceInput.of(
+            folder, LayoutChoice.auto, None, None, None, depth_gt_scale=1000.0, known_intrinsics=False, intrinsics=given
+        )
+
+    with pytest.raises(InputError, match=r"K\.npy"):
+        source(None).open()
+    expected = shared_intrinsics(np.load(tmp_path / "known.npy"), folder, 8, (96, 128))
+    opened = source(tmp_path / "known.npy").open().video
+    np.testing.assert_array_equal(opened.intrinsics, expected)
+    np.testing.assert_array_equal(source(tmp_path / "known.npy").read().intrinsics, expected)
 
 
 def test_evaluate_finds_the_sequence_of_the_run(cli: Run, finished: Path, scene: Path) -> None:

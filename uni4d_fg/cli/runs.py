@@ -13,11 +13,11 @@ from uni4d_fg.cues.manifest import has_manifest, load_cues
 from uni4d_fg.cues.plan import CueFiles, CuePlan, plan_cues
 from uni4d_fg.errors import ConfigError, InputError, OutputError
 from uni4d_fg.files import atomic_write_json
-from uni4d_fg.frontend.sequence.assemble import as_sequence
+from uni4d_fg.frontend.sequence.assemble import as_sequence, assemble_video
 from uni4d_fg.frontend.sequence.layout import Layout, LayoutOptions
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.sequence.open_video import open_video
-from uni4d_fg.frontend.sequence.read import detect_layout, read_sequence
+from uni4d_fg.frontend.sequence.read import detect_layout, find_files, read_sequence
 from uni4d_fg.frontend.sequence.selection import FrameSelection, select_frames
 from uni4d_fg.reading import expanded, is_present, read_text, resolved
 from uni4d_fg.results.run import IF_MOVED
@@ -107,7 +107,9 @@ class SequenceInput:
         if not files:
             video = open_video(root, selection, self.layout, **options)
             return OpenedInput(video, root.is_file() or video.depths is None)
-        video = open_video(root, layout=self.layout, **options)
+        own = find_files(root, self.layout, **options)
+        # What is replaced is not read: it may be what is wrong with the sequence.
+        video = assemble_video(own if files.intrinsics is None else replace(own, intrinsics=None))
         bare = root.is_file() or video.depths is None
         return OpenedInput(select_frames(files.attach(video), selection), bare)
 
