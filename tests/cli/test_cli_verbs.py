@@ -156,6 +156,23 @@ def test_validate_lists_findings_with_remedies_and_exits_with_3(cli: Run, scene:
     assert (code, json.loads(out)["ok"]) == (3, False)
 
 
+def test_validate_checks_what_reconstruct_will_use(cli: Run, scene: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(scene, tmp_path / "room"))
+    sorted((folder / "rgb").iterdir())[-1].write_bytes(b"broken")
+    (folder / "K.npy").rename(tmp_path / "known.npy")
+    (folder / "K.npy").write_bytes(b"broken")
+    code, out, _ = cli("validate", folder)
+    assert code == 3
+    assert "error: images" in out
+    assert "error: intrinsics" in out
+    words = ["validate", folder, "--stop", "7", "--intrinsics", tmp_path / "known.npy"]
+    assert cli(*words)[0] == 0
+    code, out, _ = cli(*words, "--set", "input.max_depth_m=0.1")
+    assert code == 3
+    assert "lies outside 0.05 to 0.1 m in every frame" in out
+    assert cli(*words, "--start", "3", "--stride", "4")[0] == 3
+
+
 @pytest.mark.parametrize("verb", ["validate", "reconstruct", "track", "evaluate"])
 def test_a_missing_folder_exits_with_3(cli: Run, verb: str, tmp_path: Path) -> None:
     code, out, err = cli(verb, tmp_path / "nosuch")

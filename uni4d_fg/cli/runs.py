@@ -95,15 +95,25 @@ class SequenceInput:
         return replace(self, root=str(root.resolve()))
 
     def arguments(self) -> dict[str, Any]:
-        """Return the keyword arguments of :func:`read_sequence` and :func:`validate_sequence`."""
+        """Return the keyword arguments of :func:`read_sequence`."""
         names = ("layout", "depth", "masks", "tracks", "depth_gt_scale", "known_intrinsics")
         return {name: getattr(self, name) for name in names}
+
+    @property
+    def selection(self) -> FrameSelection:
+        """Frames that are used, and how large. Raises InputError if that cannot be."""
+        return FrameSelection(self.start, self.stop, self.stride, self.max_size)
+
+    @property
+    def calibration(self) -> Path | None:
+        """File of the intrinsics that take the place of the sequence's own, if any."""
+        return None if self.intrinsics is None else _beside(Path(self.root), self.intrinsics)
 
     def open(self) -> OpenedInput:
         """Open the video with the cues that come with it. Raises InputError."""
         root = Path(self.root)
         options, files = self._sources()
-        selection = FrameSelection(self.start, self.stop, self.stride, self.max_size)
+        selection = self.selection
         if not files:
             video = open_video(root, selection, self.layout, **options)
             return OpenedInput(video, root.is_file() or video.depths is None)
@@ -193,9 +203,7 @@ class SequenceInput:
                 options["tracks"] = self.tracks
             else:
                 files["tracks"] = _beside(root, self.tracks)
-        if self.intrinsics is not None:
-            files["intrinsics"] = _beside(root, self.intrinsics)
-        return options, CueFiles(**files, classes=self.classes)
+        return options, CueFiles(**files, intrinsics=self.calibration, classes=self.classes)
 
     def _looks_like_uni4d(self) -> bool:
         named = self.depth if self.depth is not None and _is_named_in(Path(self.root), self.depth) else None

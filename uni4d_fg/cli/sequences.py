@@ -26,17 +26,32 @@ def validate(
     depth: options.Depth = None,
     masks: options.Masks = None,
     tracks: options.Tracks = None,
+    intrinsics: options.IntrinsicsFile = None,
+    start: options.Start = 0,
+    stop: options.Stop = None,
+    stride: options.Stride = 1,
+    config: options.ConfigChoice = None,
+    changes: options.Overrides = None,
     depth_gt_scale: options.DepthScale = 1000.0,
     known_intrinsics: options.KnownIntrinsics = False,
     json: options.Json = False,
 ) -> None:
-    """Check a sequence: what is there, what is wrong, what to do. Exit code 3 if it cannot be used."""
+    """Check a sequence: what is there, what is wrong, what to do. Exit code 3 if it cannot be used.
+
+    Options as `reconstruct` will get them: what they leave out or replace is not read, and of a configuration the
+    limits of depth count.
+    """
+    from uni4d_fg.config.load import load_config
     from uni4d_fg.frontend.sequence.validate import validate_sequence
 
     source = SequenceInput.of(
-        seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics
-    )
-    report = validate_sequence(seq, **source.arguments())
+        seq, layout, depth, masks, tracks, depth_gt_scale=depth_gt_scale, known_intrinsics=known_intrinsics,
+        intrinsics=intrinsics, start=start, stop=stop, stride=stride,
+    )  # fmt: skip
+    report = validate_sequence(
+        seq, selection=source.selection, intrinsics=source.calibration,
+        limits=load_config(config, changes or ()).input, **source.arguments(),
+    )  # fmt: skip
     if json:
         print_json(report.to_dict())
     else:

@@ -13,8 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sequence_samples import FRAMES, HEIGHT, TRACKS, WIDTH, cut_file, native_folder, rewrite_npz, write_image
 
+from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.errors import InputError
+from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.frontend.sequence.read import read_sequence
+from uni4d_fg.frontend.sequence.selection import FrameSelection
 from uni4d_fg.frontend.sequence.validate import validate_sequence
 
 
@@ -94,6 +97,53 @@ def test_depth_that_is_missing_or_in_the_wrong_unit(tmp_path: Path) -> None:
 def said_of(root: Path, depth: str, severity: str) -> list[tuple[str, str]]:
     report = validate_sequence(root, depth=depth)
     return [(f.item, f.message) for f in report.findings if f.severity == severity]
+
+
+def test_limits_of_depth_are_those_of_the_configuration(tmp_path: Path) -> None:
+    root = native_folder(tmp_path)
+    np.save(root / "depth.npy", np.full((FRAMES, HEIGHT, WIDTH), 1500.0))
+    assert validate_sequence(root, depth="depth", limits=InputConfig(max_depth_m=2000.0)).ok
+    (error,) = validate_sequence(root, limits=InputConfig(max_depth_m=0.4)).of("error")
+    assert (error.item, "lies outside 0.05 to 0.4 m in every frame" in error.message) == ("depth", True)
+
+
+def test_frames_that_are_not_used_are_not_read(tmp_path: Path) -> None:
+    root = native_folder(tmp_path)
+    for folder in ("rgb", "depth_cue", "masks"):
+        cut_file(root / folder / "frame_0006.png")
+    write_image(root / "masks" / "frame_0002.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    rewrite_npz(root / "tracks.npz", visible=np.eye(TRACKS, FRAMES, dtype=bool))
+    assert not validate_sequence(root).ok
+    report = validate_sequence(root, selection=FrameSelection(stop=3, stride=2))
+    assert report.findings == ()
+    assert {item.name: item.count for item in report.items}["masks"] == 2
+    with_full = validate_sequence(root, selection=FrameSelection(stop=3))
+    assert [f.message for f in with_full.findings] == [f"{root / 'masks'}: no pixel is static in frame(s) 1"]
+    (few,) = validate_sequence(root, selection=FrameSelection(start=1, stop=2)).of("error")[:1]
+    assert "the selection leaves 1 of 4 frames" in few.message
+
+
+def test_the_first_frame_is_always_read(tmp_path: Path) -> None:
+    root = native_folder(tmp_path)
+    cut_file(root / "depth_cue" / "frame_0000.png")
+    selection = FrameSelection(start=1)
+    (error,) = validate_sequence(root, selection=selection).of("error")
+    with pytest.raises(InputError, match=r"depth_cue/frame_0000\.png: is cut short"):
+        open_video(root, selection)
+    assert "frame_0000.png: is cut short" in error.message
+
+
+def test_intrinsics_that_are_replaced_are_not_read(tmp_path: Path) -> None:
+    root, given = native_folder(tmp_path / "room"), tmp_path / "cameras.txt"
+    (root / "K.npy").write_bytes(b"broken")
+    given.write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 20 20 8 6\n")
+    assert [f.item for f in validate_sequence(root).of("error")] == ["intrinsics"]
+    assert validate_sequence(root, intrinsics=given).findings == ()
+    given.write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 20 20 80 6\n")
+    (error,) = validate_sequence(root, intrinsics=given).of("error")
+    assert "cameras.txt: principal point (79.5, 5.5) lies outside" in error.message
+    (error,) = validate_sequence(root, intrinsics=tmp_path / "nosuch.npy").of("error")
+    assert "nosuch.npy" in error.message
 
 
 def test_masks(tmp_path: Path) -> None:

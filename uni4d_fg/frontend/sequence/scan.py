@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from uni4d_fg.arrays import IntArray
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.frames import LazyFrames
 from uni4d_fg.frontend.sequence.problems import parts_of
@@ -65,21 +66,27 @@ def scan_frames(
     frames: LazyFrames[Any],
     findings: Findings,
     visit: Callable[[int, npt.NDArray[Any]], None] = lambda frame, array: None,
+    chosen: IntArray | None = None,
 ) -> None:
-    """Read all frames, list those that cannot be read, and add a row to the table.
+    """Read frames, list those that cannot be read, and add a row to the table.
 
     Args:
         item: Name of the source.
         frames: The source.
         findings: Where findings and the row go.
         visit: Called with the frame number and array of each readable frame.
+        chosen: (N,) frames that are looked at, increasing; all when None. Whoever opens the source reads the first as
+            well.
     """
+    chosen = np.arange(len(frames)) if chosen is None else chosen
+    if len(frames) and len(chosen) and chosen[0] > 0:
+        findings.attempt(item, lambda: frames[0])
     low, high = np.inf, -np.inf
     shape: tuple[int, ...] = ()
     dtype = ""
     unlisted = 0
     listed = 0
-    for frame in range(len(frames)):
+    for frame in chosen.tolist():
         try:
             array = frames[frame]
         except InputError as error:
@@ -97,4 +104,4 @@ def scan_frames(
     if unlisted:
         findings.add("error", item, f"{unlisted} more frames cannot be used either", "repair or remove them all")
     limits = (low, high) if low <= high else None
-    findings.items.append(ItemSummary(item, len(frames), shape, dtype, limits))
+    findings.items.append(ItemSummary(item, len(chosen), shape, dtype, limits))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -65,16 +66,25 @@ def select_frames(video: Video, selection: FrameSelection) -> Video:
     Raises:
         InputError: If fewer than two frames are left.
     """
-    frames = selection.indices(video.num_frames)
-    if len(frames) < MIN_FRAMES:
-        where = video.name if video.root is None else str(video.root)
-        raise InputError(
-            f"{where}: the selection leaves {len(frames)} of {video.num_frames} frames; "
-            f"choose start, stop and stride so that at least {MIN_FRAMES} are left"
-        )
+    frames = selected_frames(selection, video.num_frames, video.root or video.name)
     if len(frames) < video.num_frames:
         video = _take(video, frames)
     return video if selection.max_size is None else resize_video(video, selection.max_size)
+
+
+def selected_frames(selection: FrameSelection, num_frames: int, where: Path | str) -> IntArray:
+    """Return the selected frames of a video of ``num_frames``, increasing.
+
+    Raises:
+        InputError: If fewer than two are left.
+    """
+    frames = selection.indices(num_frames)
+    if len(frames) < MIN_FRAMES:
+        raise InputError(
+            f"{where}: the selection leaves {len(frames)} of {num_frames} frames; "
+            f"choose start, stop and stride so that at least {MIN_FRAMES} are left"
+        )
+    return frames
 
 
 def _take(video: Video, frames: IntArray) -> Video:

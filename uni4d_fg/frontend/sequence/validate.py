@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import FloatArray
+from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.config.cues import InputConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence import assemble, naming
@@ -18,11 +19,11 @@ from uni4d_fg.frontend.sequence.calibration import (
     VaryingIntrinsics,
     guess_intrinsics,
     implausible,
-    load_given_intrinsics,
     load_intrinsics,
 )
+from uni4d_fg.frontend.sequence.calibration_files import load_calibration
 from uni4d_fg.frontend.sequence.decode import MIN_16_BIT_RANGE, check_bit_depth, is_16_bit_png
-from uni4d_fg.frontend.sequence.frame_checks import usable_depth
+from uni4d_fg.frontend.sequence.frame_checks import outside_limits, usable_depth
 from uni4d_fg.frontend.sequence.frames import FileFrames, ImageFolder, LazyFrames
 from uni4d_fg.frontend.sequence.layout import IMAGE_SUFFIXES, Layout, LayoutOptions, SequenceFiles, list_frames
 from uni4d_fg.frontend.sequence.poses import load_poses, load_timestamps
@@ -30,6 +31,7 @@ from uni4d_fg.frontend.sequence.problems import SequenceProblem, some_of
 from uni4d_fg.frontend.sequence.read import find_files
 from uni4d_fg.frontend.sequence.report import ValidationReport
 from uni4d_fg.frontend.sequence.scan import Findings, scan_frames
+from uni4d_fg.frontend.sequence.selection import FrameSelection, selected_frames
 from uni4d_fg.frontend.sequence.video import VideoFrames
 
 if TYPE_CHECKING:
@@ -43,13 +45,29 @@ PLAUSIBLE_DEPTH = (0.05, 200.0)
 """Range in meters in which a frame's median depth is expected."""
 _LIMITS = InputConfig()
 """Of the depth that is used, unless a configuration says otherwise."""
+_EVERYTHING = FrameSelection()
 
 
-def validate_sequence(root: Path, layout: Layout = "auto", **options: Unpack[LayoutOptions]) -> ValidationReport:
+def validate_sequence(
+    root: Path,
+    layout: Layout = "auto",
+    *,
+    selection: FrameSelection = _EVERYTHING,
+    intrinsics: Path | None = None,
+    limits: InputConfig = _LIMITS,
+    **options: Unpack[LayoutOptions],
+) -> ValidationReport:
     """Read every file of a sequence and list all that is wrong, odd or worth knowing.
 
-    Bad content never raises: it becomes a finding that says what to do. Arguments as in
-    :func:`~uni4d_fg.frontend.sequence.read.read_sequence`.
+    Bad content never raises: it becomes a finding that says what to do.
+
+    Args:
+        root: The sequence folder.
+        layout: "native" or "uni4d"; "auto" looks at what is there.
+        selection: Frames that will be used: of images, depth and masks the others are not read. Its size plays no part.
+        intrinsics: Calibration that will be used in place of the sequence's own, which is then not read.
+        limits: Of the depth that will be used.
+        **options: :class:`~uni4d_fg.frontend.sequence.layout.LayoutOptions`.
 
     Returns:
         The findings and a table of what was found.
@@ -60,7 +78,8 @@ def validate_sequence(root: Path, layout: Layout = "auto", **options: Unpack[Lay
     if files is not None:
         for problem in files.problems:
             findings.add_error("sequence", problem)
-        _Validation(files, findings).run()
+        files = files if intrinsics is None else replace(files, intrinsics=intrinsics)
+        _Validation(files, findings, selection, limits).run()
     found_layout = None if files is None else files.layout
     return ValidationReport(root, found_layout, tuple(findings.findings), tuple(findings.items))
 
@@ -68,9 +87,13 @@ def validate_sequence(root: Path, layout: Layout = "auto", **options: Unpack[Lay
 class _Validation:
     """One pass over the items of a sequence; later items are compared with the images."""
 
-    def __init__(self, files: SequenceFiles, findings: Findings) -> None:
+    def __init__(
+        self, files: SequenceFiles, findings: Findings, selection: FrameSelection, limits: InputConfig
+    ) -> None:
         self.files = files
         self.findings = findings
+        self.selection = selection
+        self.limits = limits
         self.size: tuple[int, int] | None = None
         self.num_frames: int | None = None
         self.image_stems: list[str] | None = None
@@ -108,10 +131,13 @@ class _Validation:
         self._other_truth(num_frames, size)
 
     def _images(self, path: Path) -> None:
-        images = self.findings.attempt("images", lambda: _open_images(path))
+        # As it is opened: only of a lone video file the end is not looked at.
+        stop = self.selection.stop if path == self.files.root else None
+        images = self.findings.attempt("images", lambda: _open_images(path, stop))
         if images is None:
             return
         self.num_frames = len(images)
+        chosen = self._chosen(images)
         if isinstance(images, ImageFolder):
             self.image_stems = [file.stem for file in images.paths]
             naming.check_numbering(self.image_stems, self.findings)
@@ -123,12 +149,12 @@ class _Validation:
         def visit(frame: int, image: npt.NDArray[np.uint8]) -> None:
             if not isinstance(images, ImageFolder):
                 return
-            if frame == 0:
+            if frame == chosen[0]:
                 self.findings.attempt("images", lambda: check_bit_depth(*assemble.sampled(images.paths)))
             if int(image.max(initial=0)) < MIN_16_BIT_RANGE // 256 and is_16_bit_png(images.paths[frame]):
                 black.append(frame)
 
-        scan_frames("images", images, self.findings, visit)
+        scan_frames("images", images, self.findings, visit, chosen)
         if black:
             self.findings.add(
                 "warning",
@@ -139,6 +165,13 @@ class _Validation:
         if self.findings.items[-1].shape:
             self.size = images.size
         self.findings.attempt("images", lambda: assemble.check_length(path, len(images)))
+        if len(chosen) < len(images):
+            self.findings.attempt("images", lambda: selected_frames(self.selection, len(images), path))
+
+    def _chosen(self, frames: LazyFrames[Any]) -> IntArray:
+        """Return the frames of a source that are used; of those that it lacks :meth:`_pairing` tells."""
+        chosen = self.selection.indices(len(frames) if self.num_frames is None else self.num_frames)
+        return chosen[chosen < len(frames)]
 
     def _frame_times(self, images: VideoFrames) -> None:
         """Say where the times of a video file are from, if not from a constant frame rate."""
@@ -167,21 +200,25 @@ class _Validation:
             return
         self._pairing(item, path, frames)
         missing: list[float] = []
+        medians: list[float] = []
         empty: list[int] = []
         odd: list[int] = []
         usable: list[int] = []
 
         def visit(frame: int, depth: npt.NDArray[np.float32]) -> None:
             known = depth[np.isfinite(depth)]
-            if usable_depth(known, _LIMITS).any():
+            if usable_depth(known, self.limits).any():
                 usable.append(frame)
             missing.append(1.0 - known.size / max(depth.size, 1))
             if not known.size:
                 empty.append(frame)
-            elif not PLAUSIBLE_DEPTH[0] <= float(np.median(known)) <= PLAUSIBLE_DEPTH[1]:
+                return
+            medians.append(float(np.median(known)))
+            if not PLAUSIBLE_DEPTH[0] <= medians[-1] <= PLAUSIBLE_DEPTH[1]:
                 odd.append(frame)
 
-        scan_frames(item, frames, self.findings, visit)
+        scan_frames(item, frames, self.findings, visit, self._chosen(frames))
+        of_no_use = item == "depth" and bool(medians) and not usable
         if missing and len(empty) == len(missing):
             self.findings.add("error", item, f"{path}: all depth is missing", "check how the depth was exported")
         elif empty:
@@ -192,7 +229,6 @@ class _Validation:
                 "replace these depth maps; the frames are tied by their neighbors only",
             )
         if odd:
-            of_no_use = item == "depth" and not usable
             self.findings.add(
                 "error" if of_no_use else "warning",
                 item,
@@ -200,6 +236,9 @@ class _Validation:
                 f"in frame(s) {some_of(odd)}",
                 "check the unit: PNGs are in millimeters, .npy in meters",
             )
+        elif of_no_use:
+            outside = outside_limits(float(np.median(medians)), self.limits, "m", "in every frame")
+            self.findings.add_error(item, SequenceProblem(path, *outside))
         if len(empty) < len(missing) and np.mean(missing) > MOSTLY_MISSING:
             self.findings.add(
                 "warning",
@@ -212,7 +251,7 @@ class _Validation:
         frames = self.findings.attempt("true masks", lambda: assemble.open_masks(path, self.size))
         if frames is not None:
             self._pairing("true masks", path, frames)
-            scan_frames("true masks", frames, self.findings, lambda frame, mask: None)
+            scan_frames("true masks", frames, self.findings, chosen=self._chosen(frames))
 
     def _masks(self, path: Path | None) -> None:
         if path is None:
@@ -237,8 +276,9 @@ class _Validation:
             elif moving.all():
                 full.append(frame)
 
-        scan_frames("masks", frames, self.findings, visit)
-        if empty and len(empty) == len(frames):
+        chosen = self._chosen(frames)
+        scan_frames("masks", frames, self.findings, visit, chosen)
+        if empty and len(empty) == len(chosen):
             self.findings.add(
                 "info",
                 "masks",
@@ -247,7 +287,7 @@ class _Validation:
             )
         if full:
             self.findings.add(
-                "error" if len(full) == len(frames) else "warning",
+                "error" if len(full) == len(chosen) else "warning",
                 "masks",
                 f"{path}: no pixel is static in frame(s) {some_of(full)}",
                 "check that 0 means static; the camera cannot be found from moving things",
@@ -270,7 +310,7 @@ class _Validation:
                 "add K.npy, or leave the intrinsics free",
             )
             return
-        intrinsics = self._array("intrinsics", lambda p: load_given_intrinsics(p, num_frames, size), path)
+        intrinsics = self._array("intrinsics", lambda p: load_calibration(p, num_frames, size).intrinsics, path)
         odd = None if intrinsics is None else implausible(intrinsics, size)
         if odd:
             self.findings.add("warning", "intrinsics", f"{path}: {odd}", CHECK_SIZE)
@@ -298,7 +338,9 @@ class _Validation:
                 f"{path}: {outside} visible observations lie outside the image and are taken as not visible",
                 "check that the tracks were made on images of this size, as (x, y)",
             )
-        if not tracks.visible.any():
+        chosen = self.selection.indices(num_frames)
+        seen = tracks.visible[:, chosen].any(axis=0)
+        if not seen.any():
             self.findings.add(
                 "warning",
                 "tracks",
@@ -306,7 +348,7 @@ class _Validation:
                 "run the tracker again, or remove the file",
             )
             return
-        unseen = np.flatnonzero(~tracks.visible.any(axis=0)).tolist()
+        unseen = chosen[~seen].tolist()
         if unseen:
             self.findings.add(
                 "warning",
@@ -347,10 +389,10 @@ class _Validation:
                 self.findings.add_error("true intrinsics", error)
 
 
-def _open_images(path: Path) -> ImageFolder | VideoFrames:
+def _open_images(path: Path, stop: int | None) -> ImageFolder | VideoFrames:
     """Open the images even if the first of them is broken: the size is that of the first readable one."""
     if not path.is_dir():
-        return VideoFrames(path)
+        return VideoFrames(path, stop)
     paths = list_frames(path, IMAGE_SUFFIXES)
     for file in paths:
         try:
