@@ -176,6 +176,19 @@ def test_wrong_input_is_one_clear_error(scene: Simulation, static: BoolArray) ->
         run(scene, np.zeros_like(static))
 
 
+def test_too_few_tracks_are_told_from_masks_that_leave_none(scene: Simulation, static: BoolArray) -> None:
+    with pytest.raises(DegenerateProblemError) as raised:
+        run(scene, np.zeros_like(static))
+    tracks = scene.sequence.tracks
+    assert tracks is not None
+    total = int((tracks.visible.sum(axis=1) > 1).sum())
+    assert f"only 0 tracks are static, of {total} in " in str(raised.value)
+    assert "15 are needed: the others are seen on what masks mark as moving. Check the masks" in str(raised.value)
+    with pytest.raises(DegenerateProblemError, match=r"has only 3 tracks that two .*grid_columns") as raised:
+        run(scene, np.ones(3, dtype=bool), tracks=tracks.select(np.arange(3)))
+    assert "masks" not in str(raised.value)
+
+
 def stop_after(calls: int) -> Callable[[], bool]:
     left = iter(range(calls))
     return lambda: next(left, None) is None

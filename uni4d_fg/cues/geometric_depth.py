@@ -16,6 +16,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray, rows_by_group
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.models import Config
+from uni4d_fg.counted import counted
 from uni4d_fg.cues.borrowed_points import beside_masks, with_borrowed
 from uni4d_fg.cues.camera_noise import CameraNoise
 from uni4d_fg.cues.ground_plane import Ground, find_ground
@@ -132,10 +133,7 @@ def depth_from_motion(
         )
     observations = observations_of_tracks(tracks, is_static)
     if len(np.unique(observations.track)) < config.geometric_depth.min_pose_points:
-        raise DegenerateProblemError(
-            f"depth from motion: only {len(np.unique(observations.track))} tracks are static. Check the masks (is "
-            "everything marked as moving?) and the tracks, or give depth maps"
-        )
+        raise DegenerateProblemError(_too_few(video, tracks, observations, config.geometric_depth.min_pose_points))
     structure = structure_from_motion(
         observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop, with_doubts,
         camera=camera, any_camera=camera is None, blur_px=tracks.blur_px, start=start,
@@ -146,6 +144,23 @@ def depth_from_motion(
         is_sought = ideal.is_plain and config.input.intrinsics == "free"
         return _without_parallax(video, tracks, is_static, observations, ideal, config.geometric_depth, is_sought)
     return _with_maps(video, tracks, observations, structure, config, reporter, should_stop)
+
+
+def _too_few(video: Video, tracks: Tracks, static: Observations, needed: int) -> str:
+    """Say why fewer tracks than are needed are static, and what to do."""
+    everything = observations_of_tracks(tracks, np.ones(tracks.num_tracks, dtype=bool))
+    found, total = (len(np.unique(seen.track)) for seen in (static, everything))
+    if total < needed:
+        return (
+            f"depth from motion: {video.name} has only {counted(total, 'track')} that two frames see, and {needed} are "
+            "needed; make more of them (tracking.grid_columns, tracking.grid_rows), or give tracks (--tracks) or depth "
+            "maps (--depth)"
+        )
+    return (
+        f"depth from motion: only {found} tracks are static, of {total} in {video.name}, and {needed} are needed: the "
+        "others are seen on what masks mark as moving. Check the masks (is 0 what is static, and does anything "
+        "stand still?), make more tracks (tracking.grid_columns, tracking.grid_rows), or give depth maps (--depth)"
+    )
 
 
 def _with_maps(
