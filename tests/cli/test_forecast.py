@@ -10,6 +10,7 @@ from uni4d_fg.cli.expected_time import expected_time
 from uni4d_fg.cli.forecast import Forecast, ForecastReporter, Share, expected_shares
 from uni4d_fg.cli.main import application
 from uni4d_fg.cli.progress import left, progress_reporter
+from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.plan import CuePlan
 from uni4d_fg.frontend.sequence.write import write_native
@@ -148,6 +149,17 @@ def test_a_lens_is_looked_for_once() -> None:
     assert tasks(CuePlan(depth="geometry", masks="motion")).count("lens") == 0
 
 
+@pytest.mark.parametrize("plan", [CuePlan(), CuePlan(depth="geometry", masks="motion")])
+def test_a_rolling_shutter_is_forecast_where_it_is_looked_for(plan: CuePlan) -> None:
+    def count(*changes: str) -> int:
+        shares = expected_shares(60, SIZE, load_config("default", list(changes)), plan, None)
+        return [share.task for share in shares].count("rolling shutter")
+
+    assert count() == 1
+    assert count("camera.rolling_shutter=off") == 0
+    assert count("input.poses=fixed") == 0
+
+
 def test_lines_say_how_long_it_will_take(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     forecast = Forecast([Share("a", 10), Share("b", 30)], clock)
@@ -164,7 +176,10 @@ def test_doctor_says_where_time_will_go(tmp_path: Path) -> None:
     write_native(sequence, tmp_path / "clip")
     found = expected_time(tmp_path / "clip", None)
     tasks = [task["task"] for task in found["tasks"]]
-    assert tasks == ["tracks", "lens", "camera init", "bundle adjustment", "nonrigid", "fusion", "clouds and pictures"]
+    assert tasks == [
+        "tracks", "rolling shutter", "lens", "camera init", "bundle adjustment", "nonrigid", "fusion",
+        "clouds and pictures",
+    ]  # fmt: skip
     assert found["num_frames"] == 3
     assert sum(task["share"] for task in found["tasks"]) == pytest.approx(1.0)
     assert found["seconds"] == pytest.approx(sum(task["seconds"] for task in found["tasks"]))

@@ -190,6 +190,8 @@ def expected_shares(
         plan: Which cues are made.
         tracks: Those that the video brings.
     """
+    from uni4d_fg.pipeline.lens import is_readout_sought  # loads the solvers
+
     size = num_frames * image_size[0] * image_size[1] / 1e6
     tracking = 0.55 + 0.2 * size
     shares: list[Share] = []
@@ -211,6 +213,8 @@ def expected_shares(
                 _motion(add)
     known = tracks is not None or not plan.is_given
     shares.append(Share("tracks", 0.05 + 0.02 * size if known else tracking))
+    if is_readout_sought(config):
+        add("rolling shutter", 0.25 if moved else 0.48, 0.009)
     if not moved:  # of a camera that motion told, structure from motion has found the lens
         add("lens", 0.42, 0.016)
     add("camera init", 0.15, 0.0)
