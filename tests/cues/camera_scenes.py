@@ -31,10 +31,10 @@ def ramp(ratio: float) -> np.ndarray:
     return zoom / zoom.max()
 
 
-def structure(scene: TrackedScene, *changes: str) -> Structure:
+def structure(scene: TrackedScene, *changes: str, camera: CameraModel | None = None) -> Structure:
     found = structure_from_motion(
         scene.observations, FRAMES, SIZE, GUESS, load_config("default", list(changes)), SilentReporter(),
-        lambda: False, any_camera=True,
+        lambda: False, camera=camera, any_camera=True,
     )  # fmt: skip
     assert found is not None
     return found

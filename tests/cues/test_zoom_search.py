@@ -89,3 +89,15 @@ def test_a_similarity_tells_a_zoom_of_a_camera_that_only_turns() -> None:
     np.testing.assert_allclose(
         similarities(scene.observations, FRAMES, SIZE), np.linspace(0, np.log(1.6), 20), atol=0.02
     )
+
+
+@pytest.mark.parametrize("ratio", [1.6, 1.0])
+def test_a_zoom_that_was_found_among_things_that_move_must_be_asked_for_without_them(ratio: float) -> None:
+    """As ripples of water had asked for one, of which the tracks that are left after masking know nothing."""
+    scene, focal = zooming(sideways(FRAMES), ratio)
+    known = CameraModel(WIDE, zoom=ramp(1.6))
+    found = structure(scene, camera=known)
+    assert (found.camera.zoom is None) is (ratio == 1.0)
+    zoom = np.ones(FRAMES) if found.camera.zoom is None else found.camera.zoom
+    np.testing.assert_allclose(found.intrinsics[0] * zoom, focal, rtol=0.03)
+    assert path_error(found, scene) < 0.004

@@ -288,8 +288,8 @@ class _Gathering:
         """Return a lens or a zoom that needs not be looked for; None lets the tracks tell.
 
         A lens that was found among things that move is looked for again once they are masked: they can mimic one. But
-        if all tracks of the picture ask for none, those that are left after masking hardly do. A zoom changes much
-        more, and its search takes twice as long.
+        if all tracks of the picture ask for none, those that are left after masking hardly do. Whether there is a zoom
+        is asked again, too, but not which: its search takes twice as long.
         """
         camera = self.camera
         if camera is None or camera.zoom is not None or not self.video.lens.is_pinhole:

@@ -116,7 +116,8 @@ def depth_from_motion(
         should_stop: Polled often.
         with_doubts: Also look for what the motion leaves open; not needed of what only leads to masks.
         camera: A lens or a zoom that is known, with the intrinsics to start from, or a pinhole if there is none; None
-            looks for one, and for a rolling shutter, as section ``camera`` says.
+            looks for one, and for a rolling shutter, as section ``camera`` says. A zoom is taken if these
+            tracks ask for one, too.
         start: Cameras that were found before; they are taken where they explain the tracks best.
 
     Raises:
@@ -136,7 +137,7 @@ def depth_from_motion(
         raise DegenerateProblemError(_too_few(video, tracks, observations, config.geometric_depth.min_pose_points))
     structure = structure_from_motion(
         observations, video.num_frames, video.image_size, intrinsics, config, reporter, should_stop, with_doubts,
-        camera=camera, any_camera=camera is None, blur_px=tracks.blur_px, start=start,
+        camera=camera, any_camera=camera is None or camera.zoom is not None, blur_px=tracks.blur_px, start=start,
     )  # fmt: skip
     if structure is None:
         ideal = camera or CameraModel(intrinsics)

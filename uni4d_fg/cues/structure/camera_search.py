@@ -87,11 +87,10 @@ def find_camera(
         SolverError: If bundle adjustment fails.
     """
     settings = config.camera
-    sharp = sharp_frames(blur_px, len(scene.registered))
-    part = part_of(scene, settings.observations, sharp)
+    plain = _pinhole(scene, config, blur_px)
+    part = plain.scene
     if not part.good.any():
         return None
-    plain = Fitted(CameraModel(part.intrinsics), part)
     starts = [proposed] if proposed is not None and proposed.zoom is not None else []
     if asks_for_zoom(plain, config):
         starts.append(similar_zoom(scene, image_size))
@@ -117,6 +116,18 @@ def find_camera(
             else:
                 open_focal = focal_range(zoom)
     return None if best is plain and not open_focal else FoundCamera(best.camera, gain, open_focal)
+
+
+def needs_zoom(scene: GrowingScene, config: Config, blur_px: Float32Array | None = None) -> bool:
+    """Tell whether the tracks of a scene that was grown without a zoom ask for one. Arguments as of `find_camera`."""
+    plain = _pinhole(scene, config, blur_px)
+    return not plain.scene.good.any() or asks_for_zoom(plain, config)
+
+
+def _pinhole(scene: GrowingScene, config: Config, blur_px: Float32Array | None) -> Fitted:
+    """Return the part of a scene that cameras are fitted to, with the pinhole that it was grown with."""
+    part = part_of(scene, config.camera.observations, sharp_frames(blur_px, len(scene.registered)))
+    return Fitted(CameraModel(part.intrinsics), part)
 
 
 def lens_strength(camera: CameraModel, image_size: tuple[int, int], config: Config) -> Strength:

@@ -14,7 +14,7 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import without_rolling_shutter
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
 from uni4d_fg.cues.structure.camera_fit import zoom_freedom
-from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength
+from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength, needs_zoom
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval, focal_is_open
@@ -148,7 +148,8 @@ def structure_from_motion(
         should_stop: Polled before every frame.
         with_doubts: Also look for what the tracks leave open; else there is one focal length and no rival.
         camera: A lens or a zoom that is known; None for a pinhole.
-        any_camera: Also look for a lens and a zoom, as section ``camera`` says, where intrinsics are free.
+        any_camera: Also look for a lens and a zoom, as section ``camera`` says, where intrinsics are free and none is
+            known; a known zoom must be asked for by these tracks, too.
         proposed: Then also try the zoom of this camera.
         blur_px: (T,) length of the motion blur of each frame, where it is known: sharp ones tell a lens.
         start: Cameras that are taken instead of those that starting views lead to where they explain the tracks better.
@@ -165,6 +166,8 @@ def structure_from_motion(
     if should_stop():
         raise Cancelled("structure from motion stopped")
     search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop, start)
+    if any_camera and camera is not None and camera.zoom is not None:
+        camera = camera if search.needs_zoom(observations, intrinsics, blur_px) else None
     known, seen = camera, observations
     if camera is None or camera.is_plain:
         camera = CameraModel(intrinsics)
@@ -174,7 +177,7 @@ def structure_from_motion(
         return None
     beside: list[float] = []  # focal lengths, px, of cameras that explain the tracks nearly as well
     readout = None
-    if any_camera and free_focal:
+    if any_camera and free_focal and camera.is_plain:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
         if not config.camera.reads_at_once:
@@ -336,6 +339,14 @@ class _Search:
         grow(scene, self.reporter)
         trim_and_converge(scene)
         return nearer_to_the_tracks(scene)
+
+    def needs_zoom(self, real: Observations, intrinsics: FloatArray, blur_px: Float32Array | None) -> bool:
+        """Tell whether tracks (as the images show them) ask for a zoom of a scene that is grown without one."""
+        self.reporter.begin("lens and zoom", None)
+        plain = _if_solved(lambda: replace(self, reporter=SilentReporter(), start=None).grow(real, intrinsics, True))
+        needed = plain is None or needs_zoom(plain.scene, self.config, blur_px)
+        self.reporter.end()
+        return needed
 
     def at_one_time(
         self, grown: _Grown, observations: Observations, intrinsics: FloatArray
