@@ -54,10 +54,11 @@ class TrackingConfig(Section):
         "Where the camera turns so fast that an image is blurred along its motion, make first views as blurred before "
         "they are looked for in it.",
     )
-    bridge_frames: int = setting(
-        0,
+    bridge_frames: int | None = setting(
+        None,
         "Points that something hides together with those around them are looked for again behind it, for this many "
-        "frames, and keep their tracks: 25 bridges an occlusion of 15. 0: what is lost stays lost.",
+        "frames, and keep their tracks: 25 bridges an occlusion of 15. 0: what is lost stays lost. null: 25 in a video "
+        "in which something sweeps over the picture, so that hardly any track outlives it; else 0.",
         ge=0,
     )
     max_drift_px: float | None = setting(

@@ -10,6 +10,7 @@ from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.frontend.synthetic.simulate import simulate
 from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.frontend.tracks.interruption import is_interrupted
 from uni4d_fg.frontend.tracks.lucas_kanade import track_grid
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
 
@@ -47,8 +48,8 @@ def video(behind: int | None = None) -> ImageArray:
     return images
 
 
-def track(images: ImageArray, bridge_frames: int) -> Tracks:
-    config = CONFIG.model_copy(update={"bridge_frames": bridge_frames})
+def track(images: ImageArray, bridge_frames: int | None, query_interval: int = FRAMES) -> Tracks:
+    config = CONFIG.model_copy(update={"bridge_frames": bridge_frames, "query_interval": query_interval})
     return track_grid(ArrayFrames(images), config)
 
 
@@ -58,6 +59,37 @@ def seen_again(tracks: Tracks) -> tuple[FloatArray, BoolArray]:
     passed = np.stack([truth[:, t, 0] < block(t)[0] for t in range(FRAMES)], axis=1)
     inside = ((truth >= 8) & (truth <= [WIDTH - 9, HEIGHT - 9])).all(axis=2)
     return truth, passed & inside
+
+
+@pytest.mark.parametrize("passes", [True, False])
+def test_where_something_sweeps_over_the_picture_it_is_bridged_without_being_asked_for(passes: bool) -> None:
+    """A block as wide as most of the picture, which nothing outlives; and the same video before it comes."""
+    wide, planes = 170, texture(0, HEIGHT + 40, WIDTH + 40)
+    images = np.empty((50, HEIGHT, WIDTH), np.uint8)
+    for t in range(len(images)):
+        shift = np.array([[1, 0, SPEED[0] * t - 20], [0, 1, SPEED[1] * t - 20]])
+        images[t] = np.rint(cv2.warpAffine(planes, shift, (WIDTH, HEIGHT)))
+        end = 20 * (t - 10)
+        left, right = min(max(end - wide, 0), WIDTH), max(min(end, WIDTH), 0)
+        if passes and left < right:
+            images[t, :, left:right] = texture(2, HEIGHT, WIDTH)[:, : right - left]
+    lost, bridged, found = (track(images, frames, query_interval=10) for frames in (0, 25, None))
+    assert is_interrupted(lost.visible) is passes
+    expected = bridged if passes else lost
+    np.testing.assert_array_equal(found.visible, expected.visible)
+    np.testing.assert_array_equal(found.uv, expected.uv)
+    outlive = [np.count_nonzero(tracks.visible[:, 8] & tracks.visible[:, 45]) for tracks in (lost, found)]
+    if passes:
+        assert outlive[1] > 100 + 2 * outlive[0]
+
+
+def test_tracks_that_are_short_throughout_are_not_interrupted(rng: np.random.Generator) -> None:
+    first = rng.integers(-11, 60, 4000)[:, None]
+    short = (np.arange(60) >= first) & (np.arange(60) < first + 12)
+    assert not is_interrupted(short)
+    cut = short & ~((first < 30) & (np.arange(60) >= 30))  # all end at once
+    assert is_interrupted(cut)
+    assert not is_interrupted(cut[:, 20:40])  # too short to tell
 
 
 @pytest.mark.parametrize("refine", ["off", "on"])
@@ -76,7 +108,7 @@ def test_most_points_are_found_behind_what_hid_them(refine: str) -> None:
 
 
 def test_what_is_lost_stays_lost_without() -> None:
-    tracks = track_grid(ArrayFrames(video()), CONFIG)
+    tracks = track(video(), 0)
     _, passed = seen_again(tracks)
     assert not (tracks.visible & passed).any()
 

@@ -132,6 +132,8 @@ class Bridges:
     """What one sweep has lost from sight."""
 
     config: TrackingConfig
+    frames: int
+    """For how many what is hidden is looked for."""
     _remembered: list[_Remembered] = field(default_factory=list)
     """The last two frames."""
     _motions: list[Motion] = field(default_factory=list)
@@ -195,7 +197,7 @@ class Bridges:
             return
         last = self._remembered[-1]
         lost = _lost_with_neighbors(last, np.isin(last.track, track, assume_unique=True), self._hidden.points)
-        self._hidden = self._hidden.picked(self._hidden.step >= self._step - self.config.bridge_frames)
+        self._hidden = self._hidden.picked(self._hidden.step >= self._step - self.frames)
         self._hidden.move(self._motions[-1])
         # What came in front may be in the windows of the last frame: points are known in the one before that.
         todo = np.ones(len(lost), np.bool_)

@@ -19,7 +19,7 @@ from uni4d_fg.frontend.tracks.first_views import refines
 from uni4d_fg.frontend.tracks.io import load_tracks, save_tracks
 from uni4d_fg.frontend.tracks.lucas_kanade import Progress, ShouldStop, track_grid
 
-TRACKER_VERSION = 5
+TRACKER_VERSION = 6
 """Part of the cache key; raised whenever the tracker gives other tracks for the same input."""
 
 

@@ -28,6 +28,7 @@ from uni4d_fg.frontend.sequence.model import FrameSource
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.frontend.tracks.bridging import Bridges
 from uni4d_fg.frontend.tracks.followed_points import FollowedPoints
+from uni4d_fg.frontend.tracks.interruption import is_interrupted
 from uni4d_fg.frontend.tracks.optical_flow import has_not_drifted
 from uni4d_fg.frontend.tracks.reseeding import corners_of_empty_cells
 
@@ -36,6 +37,8 @@ Progress = Callable[[int, int], None]
 ShouldStop = Callable[[], bool]
 """Asked between steps; True ends the work with :class:`~uni4d_fg.errors.Cancelled`."""
 
+_BRIDGED = 25
+"""`bridge_frames` where tracks are interrupted and the configuration leaves it open."""
 _Observations = list[tuple[int, IntArray, Float32Array]]  # frame, track indices (n,), pixels (n, 2)
 
 
@@ -60,7 +63,8 @@ def track_grid(
     """Track grids of points through a video.
 
     Args:
-        images: T images (H, W, 3) uint8 RGB, or (H, W) uint8 gray; each is read twice, in order.
+        images: T images (H, W, 3) uint8 RGB, or (H, W) uint8 gray; each is read twice, in order, and twice again if
+            `bridge_frames` is None and :func:`~uni4d_fg.frontend.tracks.interruption.is_interrupted` says so.
         config: Grid, window and checks.
         progress: Told the steps done and to do after every step.
         should_stop: Asked before every step.
@@ -72,9 +76,19 @@ def track_grid(
         InputError: If the images differ in size or are not uint8.
         Cancelled: If ``should_stop`` said so.
     """
-    num_frames = len(images)
-    if num_frames == 0:
+    if len(images) == 0:
         raise InputError("tracking: the sequence has no images")
+    tracks = _swept(images, config, progress, should_stop)
+    if config.bridge_frames is None and is_interrupted(tracks.visible):
+        bridged = config.model_copy(update={"bridge_frames": _BRIDGED})
+        tracks = _swept(images, bridged, progress, should_stop)
+    return tracks
+
+
+def _swept(
+    images: FrameSource[ImageArray], config: TrackingConfig, progress: Progress | None, should_stop: ShouldStop | None
+) -> Tracks:
+    num_frames = len(images)
     image_size = _gray(images[0], None, 0).shape
     grid = query_grid((image_size[0], image_size[1]), config)
     queries: dict[int, _Queries] = {}
@@ -141,7 +155,7 @@ class _Sweep:
 
     def __post_init__(self) -> None:
         config = self.followed.config
-        self.bridges = Bridges(config) if config.bridge_frames else None
+        self.bridges = Bridges(config, config.bridge_frames) if config.bridge_frames else None
 
     def start(self, queries: _Queries, image: ImageArray) -> None:
         """Add points in the frame where they start."""
