@@ -16,6 +16,13 @@ from uni4d_fg.optim.objective import Reweightable, SolvedPart
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.summary import IterationRecord, SolveSummary, Termination
 
+_CONVERGED = 1e-7
+"""Relative decrease of the energy at which a refinement ends that tells a focal length: far in a valley, a step that
+lowers the energy by 1e-5 may still move it by several percent."""
+_PATIENCE = 10
+"""So many times more steps such a refinement may take: through a long lens that pans and moves, more than twice as many
+as others may."""
+
 
 @dataclass(frozen=True)
 class Round:
@@ -200,6 +207,12 @@ def early(solver: SolverConfig) -> SolverConfig:
     """Return the solver's options for what only leads to the solve that counts: all rounds but the last."""
     looser = solver.early_relative_decrease
     return solver if looser is None else solver.model_copy(update={"relative_decrease": looser})
+
+
+def until_converged(stage: Stage) -> Stage:
+    """Return a stage that ends only where the focal length, or what follows one that is held, stays where it is."""
+    longer = {"relative_decrease": _CONVERGED, "max_iterations": _PATIENCE * stage.solver.max_iterations}
+    return replace(stage, solver=stage.solver.model_copy(update=longer))
 
 
 def _join_schedules(kept: SolveSummary, all_of_them: list[SolveSummary]) -> SolveSummary:

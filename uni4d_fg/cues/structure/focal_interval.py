@@ -20,7 +20,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.cues.depth_settings import OPEN_FOCAL_SIGMA
-from uni4d_fg.cues.structure.growing import GrowingScene, until_converged
+from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.selection import picture_cells
 from uni4d_fg.errors import Cancelled, SolverError
 from uni4d_fg.factors.state import State
@@ -28,7 +28,7 @@ from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.optim.cluster_robust import Clusters, clustered_marginals, image_cells
 from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.stage import Stage, run_stage, until_converged
 from uni4d_fg.optim.summary import Termination
 from uni4d_fg.robust import WITHIN_95
 from uni4d_fg.slam.stages.noise import intraclass_correlation

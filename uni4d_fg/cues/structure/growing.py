@@ -22,7 +22,7 @@ from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import intrinsics_matrix
 from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.marginals import camera_marginals
-from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.stage import Stage, run_stage, until_converged
 from uni4d_fg.optim.summary import Termination
 from uni4d_fg.robust import robust_sigma
 from uni4d_fg.slam.stages.bundle_adjustment import (
@@ -36,12 +36,6 @@ from uni4d_fg.slam.stages.scene import StaticNoise
 
 _FOCAL_STEP = 0.15
 """Step of log f that cameras and points can follow."""
-_CONVERGED = 1e-7
-"""Relative decrease of the energy at which a refinement ends that tells a focal length: far in a valley, a step that
-lowers the energy by 1e-5 may still move it by several percent."""
-_PATIENCE = 10
-"""So many times more steps such a refinement may take: through a long lens that pans and moves, more than twice as many
-as others may."""
 
 
 @dataclass
@@ -353,12 +347,6 @@ class GrowingScene:
         factor = self.config.geometric_depth.median_depth / max(float(np.median(z)), 1e-9)
         self.position *= factor
         self.world_T_cam[:, :3, 3] *= factor
-
-
-def until_converged(stage: Stage) -> Stage:
-    """Return a stage that ends only where the focal length stays where it is."""
-    longer = {"relative_decrease": _CONVERGED, "max_iterations": _PATIENCE * stage.solver.max_iterations}
-    return replace(stage, solver=stage.solver.model_copy(update=longer))
 
 
 def geometric_bundle_adjustment(config: BundleAdjustmentConfig) -> BundleAdjustmentConfig:

@@ -132,8 +132,9 @@ class ToldError:
         prior = self.expected / total
         found = [np.concatenate(off) if off else np.zeros(0) for off in self.off]
         everywhere = np.concatenate(found)
-        if self.from_motion or len(everywhere) < _MIN_COMPARED:
-            return float(np.hypot(prior, self.focal_depth_error))
-        typical = [float(np.median(off if len(off) >= _MIN_COMPARED else everywhere)) for off in found]
-        at_landmarks = float(self.pixels @ np.array(typical)) / total
-        return float(np.hypot(prior**_PRIOR_SHARE * at_landmarks ** (1.0 - _PRIOR_SHARE), self.focal_depth_error))
+        told = prior
+        if not self.from_motion and len(everywhere) >= _MIN_COMPARED:
+            typical = [float(np.median(off if len(off) >= _MIN_COMPARED else everywhere)) for off in found]
+            at_landmarks = float(self.pixels @ np.array(typical)) / total
+            told = prior**_PRIOR_SHARE * at_landmarks ** (1.0 - _PRIOR_SHARE)
+        return float(np.hypot(told, self.focal_depth_error))

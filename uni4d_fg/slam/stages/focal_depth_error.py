@@ -6,20 +6,15 @@ out explain the tracks nearly as well: an error of 1 % of the focal length may b
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE
-from uni4d_fg.geometry.camera import world_to_camera
+from uni4d_fg.geometry.camera import seen_from
 from uni4d_fg.optim.levenberg_marquardt import Hooks
-from uni4d_fg.optim.stage import Stage, run_stage
+from uni4d_fg.optim.stage import Stage, run_stage, until_converged
 from uni4d_fg.slam.stages.observations import Observations
-
-_CONVERGED = 1e-7
-"""Relative decrease of the energy at which cameras and landmarks have followed: depth is what follows last."""
 
 
 def focal_depth_error(
@@ -38,9 +33,8 @@ def focal_depth_error(
         SolverError: If the system is singular.
     """
     longer = state[INTRINSICS] * np.array([np.exp(focal_sigma)] * 2 + [1.0, 1.0])
-    patient = replace(stage, solver=stage.solver.model_copy(update={"relative_decrease": _CONVERGED}))
     quiet = None if hooks is None else Hooks(should_stop=hooks.should_stop)
-    bent, _ = run_stage(patient, state.replace({INTRINSICS: longer}), quiet)
+    bent, _ = run_stage(until_converged(stage), state.replace({INTRINSICS: longer}), quiet)
     change = _log_depth(bent, observations) - _log_depth(state, observations)
     change = change[np.isfinite(change)]
     return float(np.mean(np.abs(change - np.median(change)))) if len(change) else 0.0
@@ -49,6 +43,6 @@ def focal_depth_error(
 def _log_depth(state: State, observations: Observations) -> FloatArray:
     """Return log depth (N,) of what is observed, NaN behind the camera."""
     _, row = observations.rows()
-    z = world_to_camera(state[POSE][observations.frame], state[LANDMARK][row])[:, 2]
+    z = seen_from(state[POSE], observations.frame, state[LANDMARK][row])[:, 2]
     result: FloatArray = np.log(np.where(z > 0, z, np.nan))
     return result
