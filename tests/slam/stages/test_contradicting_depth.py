@@ -52,6 +52,23 @@ def test_a_constant_cue_is_named_where_all_is_about_as_far_and_other_cues_err_by
     assert contradicting_frames(seen, FusionConfig()) == [5]
 
 
+def test_a_frame_that_shows_little_but_a_wall_is_not_named_for_what_its_cue_misses_before_it(
+    rng: np.random.Generator,
+) -> None:
+    """Somebody who passes hides what is near: nine landmarks in ten are on the wall, which the cue knows well."""
+    seen = frames(rng, set())
+    for frame in range(len(seen)):
+        near = np.arange(200) < (24 if frame == 5 else 100)
+        depth = np.where(near, 2.0, 4.0) * np.exp(0.04 * rng.standard_normal(200))
+        cue = depth * np.exp((0.02 if frame == 5 else 0.08) * rng.standard_normal(200))
+        if frame == 5:  # the place of what is near is known to it by half
+            cue[:24] = 3.6 * np.exp(0.1 * rng.standard_normal(24))
+        if frame == 8:
+            cue = np.full(200, 4.0)
+        seen[frame] = cue, np.log(depth / cue)
+    assert contradicting_frames(seen, FusionConfig()) == [8]
+
+
 def test_samples_that_err_alike_do_not_make_up_a_shift(rng: np.random.Generator) -> None:
     """A smooth error looks like a shift over a small range of depth, and things nearer than that pay for it."""
     error = {np.inf: 0.0, 0.08: 0.0}
