@@ -72,8 +72,8 @@ def test_relative_pose_is_found_among_outliers_and_is_repeatable(rng: np.random.
     pose = moved((0.02, 0.1, -0.03), (0.3, -0.05, 0.1))
     _, first, second = views(rng, pose)
     second[:60] = rng.uniform(0, 300, (60, 2))
-    found = relative_pose(first, second, K, 1.5, 5000)
-    again = relative_pose(first, second, K, 1.5, 5000)
+    found = relative_pose(first, second, K, 1.5, 5000, 0.5)
+    again = relative_pose(first, second, K, 1.5, 5000, 0.5)
     assert found is not None
     assert again is not None
     np.testing.assert_array_equal(found.first_T_second, again.first_T_second)
@@ -83,6 +83,20 @@ def test_relative_pose_is_found_among_outliers_and_is_repeatable(rng: np.random.
     assert np.degrees(np.arccos(found.first_T_second[:3, 3] @ direction)) < 3.0
     assert found.inlier[60:].mean() > 0.9
     assert found.inlier[:60].mean() < 0.2
+
+
+def test_the_pose_of_a_camera_that_moves_by_a_hundredth_of_the_distance_has_its_points(
+    rng: np.random.Generator,
+) -> None:
+    pose = moved((0.0, 0.01, 0.0), (0.02, 0.005, 0.0))
+    _, first, second = views(rng, pose, noise_px=0.05)
+    found = relative_pose(first, second, K, 1.5, 5000, 0.1)
+    assert found is not None
+    assert found.inlier.mean() > 0.95
+    far = relative_pose(first, second, K, 1.5, 5000, 0.5)  # with which few of them are near enough
+    assert far is None or far.inlier.mean() < 0.25
+    direction = pose[:3, 3] / np.linalg.norm(pose[:3, 3])
+    assert np.degrees(np.arccos(found.first_T_second[:3, 3] @ direction)) < 10.0
 
 
 def bundle(points: np.ndarray, poses: np.ndarray, uv: np.ndarray) -> RayBundle:

@@ -35,6 +35,10 @@ class GeometricDepthConfig(Section):
     min_angle_deg: float = setting(
         0.5, "Points whose rays meet at less than this do not take part in finding cameras, degrees.", gt=0, lt=90
     )
+    min_angle_px: float = setting(
+        1.5, "Where no cameras are found so, points whose rays meet at what so many pixels subtend take part: somebody "
+        "who stands and holds a camera in their hands moves it by little.", gt=0,
+    )  # fmt: skip
     growth: float = setting(
         1.3, "Bundle adjustment is repeated whenever the number of frames has grown by this factor.", gt=1
     )

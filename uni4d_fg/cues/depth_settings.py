@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from uni4d_fg.config.models import Config
 from uni4d_fg.frontend.sequence.model import Sequence
 from uni4d_fg.slam.stages import bundle_adjustment
@@ -82,3 +84,15 @@ def without_depth_prior(config: Config) -> Config:
 def without_rolling_shutter(config: Config) -> Config:
     """Return the configuration with which all rows are taken to be read at once, as those of tracks that were moved."""
     return config.model_copy(update={"camera": config.camera.model_copy(update={"rolling_shutter": "off"})})
+
+
+def with_smaller_angles(config: Config, focal_px: float) -> Config:
+    """Return the configuration with which points take part in finding cameras whose rays meet at less of an angle.
+
+    Args:
+        config: Its field ``geometric_depth.min_angle_px`` says at which.
+        focal_px: Focal length, px.
+    """
+    settings = config.geometric_depth
+    angle = min(settings.min_angle_deg, math.degrees(settings.min_angle_px / focal_px))
+    return config.model_copy(update={"geometric_depth": settings.model_copy(update={"min_angle_deg": angle})})

@@ -93,8 +93,9 @@ class GrowingScene:
         a, b = CommonTracks(self.observations, len(self.world_T_cam)).between(pair.first, pair.second)
         uv = self.observations.uv
         found = relative_pose(
-            uv[a], uv[b], self.intrinsics, 0.5 * settings.max_reprojection_px, settings.two_view_trials
-        )
+            uv[a], uv[b], self.intrinsics, 0.5 * settings.max_reprojection_px, settings.two_view_trials,
+            settings.min_angle_deg,
+        )  # fmt: skip
         if found is None:
             return 0
         self.world_T_cam[pair.second] = found.first_T_second

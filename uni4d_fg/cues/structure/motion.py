@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.depth_settings import without_rolling_shutter
+from uni4d_fg.cues.depth_settings import with_smaller_angles, without_rolling_shutter
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
+from uni4d_fg.cues.structure.all_tracks import triangulate_all
 from uni4d_fg.cues.structure.camera_fit import zoom_freedom
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength, needs_zoom
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
@@ -28,14 +29,7 @@ from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import NEARLY_AS_WELL, Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.self_calibration import focal_of_pairs
-from uni4d_fg.cues.structure.triangulation import (
-    Points,
-    RayBundle,
-    directions_far_away,
-    median_per_row,
-    reprojection_errors,
-    triangulate,
-)  # fmt: skip
+from uni4d_fg.cues.structure.triangulation import Points
 from uni4d_fg.cues.structure.trimming import trim, trim_and_converge
 from uni4d_fg.cues.structure.two_view import fit_rotation
 from uni4d_fg.errors import Cancelled, SolverError
@@ -233,7 +227,7 @@ def structure_from_motion(
             scene.hold_focal(likely)
             sigma = scene.measure_noise()
             poses = _bridge(scene.world_T_cam, scene.registered)
-    track, points, moving = _triangulate_all(observations, poses, scene)
+    track, points, moving = triangulate_all(observations, poses, scene)
     reporter.end()
     return Structure(
         poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, sigma, best.pair,
@@ -267,6 +261,9 @@ class _Search:
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
         found = self._grown(used, intrinsics, free_focal)
+        if found is None:  # or the camera hardly moves
+            closer = replace(self, config=with_smaller_angles(self.config, float(intrinsics[0])))
+            found = closer._grown(used, intrinsics, free_focal)
         rest = None if found is None else most_left_over(found.scene, used, self.image_size)
         if found is None or rest is None:
             return found
@@ -465,35 +462,3 @@ def _bridge(world_T_cam: FloatArray, registered: BoolArray) -> FloatArray:
     missing = ~registered
     out[missing, :3, :3], out[missing, :3, 3] = turned[missing], moved[missing]
     return out
-
-
-def _triangulate_all(
-    observations: Observations, poses: FloatArray, scene: GrowingScene
-) -> tuple[IntArray, Points, BoolArray]:
-    """Triangulate every track from the frames with a pose, twice: the second time without what did not fit."""
-    observations = observations.select(scene.registered[observations.frame])
-    tracks, row = observations.rows()
-    limit, huber_px = float(np.median(scene.limit_px)), scene.config.geometric_depth.triangulation_huber_px
-    rays = RayBundle(row, poses, observations.frame, observations.uv, scene.intrinsics, len(tracks))
-    points = triangulate(rays, huber_px)
-    with np.errstate(invalid="ignore"):
-        fits = points.errors_of(rays) <= scene.limit_px[observations.frame]
-        moving = points.error_px > limit
-    again = np.bincount(row, ~fits, len(tracks)) > 0
-    points = points.replaced(again, triangulate(rays.select(fits & again[row]), huber_px))
-    with np.errstate(invalid="ignore"):
-        wrong = ~(points.error_px <= limit)
-    # Rays that part meet behind the cameras: that of nothing that is at rest, unless they are all but parallel.
-    parting = ~np.isfinite(points.error_px)
-    far = rays.select(parting[row])
-    moving |= parting & (_median_error_far_away(far) > limit)
-    points.position[wrong | moving] = np.nan
-    return tracks, points, moving
-
-
-def _median_error_far_away(rays: RayBundle) -> FloatArray:
-    """Return the median reprojection error (M,) px of points too far to show parallax; 0 for tracks without a ray."""
-    position = directions_far_away(rays)
-    error = median_per_row(reprojection_errors(rays, position), rays.row, rays.count)
-    result: FloatArray = np.where(np.isnan(error), 0.0, error)
-    return result

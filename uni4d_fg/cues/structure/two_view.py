@@ -31,6 +31,9 @@ _DOUBTFUL_PX = 5.0
 """... that is, up to this."""
 _REWEIGHTINGS = 4
 """Reweighted solves of the rotation fit."""
+_FAR = 50.0 * float(np.radians(0.5))
+"""Points tell which of four poses is right up to so many baselines, over the least angle of rays (rad): OpenCV's own 50
+at half a degree."""
 _CONFIDENCE = 0.9999
 """Probability of a sample without outliers at which trials end early."""
 
@@ -124,8 +127,9 @@ def _fit_rotations(
 
 
 def relative_pose(
-    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, threshold_px: float, max_trials: int
-) -> RelativePose | None:
+    uv_first: FloatArray, uv_second: FloatArray, intrinsics: FloatArray, threshold_px: float, max_trials: int,
+    min_angle_deg: float,
+) -> RelativePose | None:  # fmt: skip
     """Find the pose between two views by a robust essential matrix; None if there is none.
 
     Args:
@@ -134,6 +138,7 @@ def relative_pose(
         intrinsics: (4,) px.
         threshold_px: Distance to the epipolar line up to which a pair agrees.
         max_trials: Trials at most.
+        min_angle_deg: Points whose rays meet at less than about half of this agree with no pose.
 
     Returns:
         The pose; the same input gives the same result (OpenCV's MAGSAC draws from a fixed seed).
@@ -147,7 +152,10 @@ def relative_pose(
     essential, agrees = found
     # The mask is changed in place: what lies behind a camera, or too far away to tell, goes out.
     agreeing = agrees[:, None].astype(np.uint8)
-    count, rotation, translation, mask = cv2.recoverPose(essential, rays[0], rays[1], np.eye(3), mask=agreeing)
+    far = _FAR / float(np.radians(min_angle_deg))
+    count, rotation, translation, mask, _ = cv2.recoverPose(
+        essential, rays[0], rays[1], np.eye(3), distanceThresh=far, mask=agreeing
+    )
     if count < 8:
         return None
     second_T_first = np.eye(4)
