@@ -58,11 +58,7 @@ def test_a_large_thing_near_the_camera_does_not_become_the_world(seed: int) -> N
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_camera_that_is_held_by_somebody_who_stands_is_found(seed: int) -> None:
     """It sways by a hundredth of the distance, so that nothing is nearer than 40 times what it moves."""
-    part = np.linspace(0.0, 1.0, FRAMES)
-    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    turns = np.stack([0.02 * np.sin(5 * part + 1), 0.03 * np.sin(7 * part), 0.01 * np.sin(6 * part + 2)], axis=1)
-    poses[:, :3, :3] = se3.so3_exp(turns)
-    poses[:, :3, 3] = 0.03 * np.stack([np.sin(6 * part), 0.6 * np.sin(9 * part + 1), 0.5 * np.cos(5 * part)], axis=1)
+    poses = camera_path(FRAMES, (0.03, -0.02, 0.02), (0.0, 0.03, 0.0))
     scene = tracked(poses, seed, noise_px=0.1, life=FRAMES)
     structure = found(scene, load_config("default", ["geometric_depth.min_parallax_px=0.4"]))
     path, turn = error_of(structure, scene)

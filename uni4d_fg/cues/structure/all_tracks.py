@@ -17,7 +17,7 @@ from uni4d_fg.cues.structure.triangulation import (
 from uni4d_fg.slam.stages.observations import Observations
 
 
-def triangulate_all(
+def points_of_all_tracks(
     observations: Observations, poses: FloatArray, scene: GrowingScene
 ) -> tuple[IntArray, Points, BoolArray]:
     """Triangulate every track from the frames with a pose, twice: the second time without what did not fit.

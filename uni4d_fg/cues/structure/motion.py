@@ -13,7 +13,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import with_smaller_angles, without_rolling_shutter
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
-from uni4d_fg.cues.structure.all_tracks import triangulate_all
+from uni4d_fg.cues.structure.all_tracks import points_of_all_tracks
 from uni4d_fg.cues.structure.camera_fit import zoom_freedom
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength, needs_zoom
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
@@ -227,7 +227,7 @@ def structure_from_motion(
             scene.hold_focal(likely)
             sigma = scene.measure_noise()
             poses = _bridge(scene.world_T_cam, scene.registered)
-    track, points, moving = triangulate_all(observations, poses, scene)
+    track, points, moving = points_of_all_tracks(observations, poses, scene)
     reporter.end()
     return Structure(
         poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, sigma, best.pair,
@@ -261,9 +261,9 @@ class _Search:
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
         found = self._grown(used, intrinsics, free_focal)
-        if found is None:  # or the camera hardly moves
-            closer = replace(self, config=with_smaller_angles(self.config, float(intrinsics[0])))
-            found = closer._grown(used, intrinsics, free_focal)
+        closer = with_smaller_angles(self.config, float(intrinsics[0]))
+        if found is None and closer != self.config:  # The camera may hardly move.
+            found = replace(self, config=closer)._grown(used, intrinsics, free_focal)
         rest = None if found is None else most_left_over(found.scene, used, self.image_size)
         if found is None or rest is None:
             return found

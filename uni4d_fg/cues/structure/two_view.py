@@ -138,7 +138,7 @@ def relative_pose(
         intrinsics: (4,) px.
         threshold_px: Distance to the epipolar line up to which a pair agrees.
         max_trials: Trials at most.
-        min_angle_deg: Points whose rays meet at less than about half of this agree with no pose.
+        min_angle_deg: Points whose rays meet at less than about twice this agree with no pose.
 
     Returns:
         The pose; the same input gives the same result (OpenCV's MAGSAC draws from a fixed seed).
