@@ -43,11 +43,15 @@ def tracks_at(uv: list[tuple[float, float]]) -> tuple[Tracks, TrackMotion]:
     return tracks, TrackMotion(np.zeros(count, bool), np.ones(count, bool), np.zeros(count))
 
 
-def ended(region: np.ndarray, image: np.ndarray, uv: list[tuple[float, float]], **changes: int) -> np.ndarray:
+def ended(
+    region: np.ndarray, image: np.ndarray, uv: list[tuple[float, float]], background: np.ndarray | None = None,
+    **changes: int,
+) -> np.ndarray:  # fmt: skip
     tracks, motion = tracks_at(uv)
     config = CONFIG.model_copy(update=changes)
     scale = np.array([image.shape[1] / region.shape[1], image.shape[0] / region.shape[0]])
-    return end_at_colors(region, image, tracks, motion, 0, scale, config)
+    background = np.zeros(image.shape[:2], bool) if background is None else background
+    return end_at_colors(region, image, background, tracks, motion, 0, scale, config)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
@@ -116,3 +120,14 @@ def test_a_region_without_anything_around_it_is_returned(rng: np.random.Generato
     whole, nothing = np.ones(SIZE, bool), np.zeros(SIZE, bool)
     np.testing.assert_array_equal(ended(whole, image, []), whole)
     np.testing.assert_array_equal(ended(nothing, image, []), nothing)
+
+
+def test_what_is_background_for_sure_is_left_out_whatever_its_color(rng: np.random.Generator) -> None:
+    mask = walker()
+    image = picture(mask, rng)
+    known = np.zeros(mask.shape, bool)
+    known[:80] = True  # the red upper half is what a red wall shows
+    found = ended(mask, image, BESIDE, background=known)
+    assert not found[:79].any()
+    assert overlap(found[82:], mask[82:]) > 0.9
+    assert not ended(mask, image, BESIDE, background=np.ones(mask.shape, bool)).any()

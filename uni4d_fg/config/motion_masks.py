@@ -43,6 +43,19 @@ class MotionMaskConfig(Section):
     baselines: tuple[int, ...] = setting(
         (2, 6, 12), "Each frame is compared with the frames this far before and after it.", min_length=1
     )
+    background_baselines: tuple[int, ...] = setting(
+        (4, 12, 24),
+        "For the second look each frame is compared with the background that those this far before and after it show.",
+        min_length=1,
+    )
+    background_margin_px: int = setting(
+        3, "What is nearer than this to what the first look found is no background, working px.", ge=0
+    )
+    background_contrast: float = setting(
+        20.0, "By how much what moves differs from the background at least, as a rule, gray levels.", gt=0
+    )
+    background_track_weight: float = setting(2.0, "What ``track_weight`` is in the second look.", ge=0)
+    background_smoothing_px: int = setting(8, "What ``smoothing_px`` is in the second look.", ge=1)
     first_guess_step: int = setting(
         5, "The first guess of what moves compares frames this far apart by the pose that most tracks agree on.", ge=1
     )
@@ -65,7 +78,7 @@ class MotionMaskConfig(Section):
         (2, 5, 10, 20), "A track is tested between frames this far apart.", min_length=1
     )
     moving_sigmas: float = setting(
-        5.0,
+        3.5,
         "A track moves if it departs from the static scene by more standard deviations than this.",
         gt=0,
         basic=True,
@@ -83,12 +96,9 @@ class MotionMaskConfig(Section):
     )
     smoothing_px: int = setting(16, "Radius within which evidence is shared among like colors, px.", ge=1)
     smoothing_contrast: float = setting(0.03, "Standard deviation of color (0 to 1) within one surface.", gt=0)
-    neighbor_frames_weight: float = setting(
-        0.5, "Weight of the evidence of the frames before and after, warped by flow.", ge=0
-    )  # fmt: skip
     threshold: float = setting(1.0, "Log odds above which a pixel moves.", basic=True)
     interpolated_threshold: float = setting(
-        0.5,
+        0.25,
         "The same where depth is interpolated between points of the static scene: what masks miss is then put on what "
         "is behind it, which costs more than what they hold too much.",
     )

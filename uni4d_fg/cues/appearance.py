@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, ImageArray
+from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.depth_range import DepthRange, depth_range
 from uni4d_fg.cues.guided_filter import sum_colors
@@ -28,6 +28,18 @@ _MEDIAN_OF_SQUARE = 0.455
 """Of the square of a standard normal variable."""
 _SAMPLE = 4
 """Medians over an image take every fourth pixel in x and y."""
+
+
+@dataclass(frozen=True)
+class ComparedFrame:
+    """What others are compared with of a frame at working size; arrays (h, w)."""
+
+    color: Float32Array | ImageArray
+    """(h, w, 3), slightly blurred, gray levels."""
+    nearest: Float32Array
+    """Least log depth around."""
+    known: BoolArray
+    """Depth is known somewhere around."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +60,11 @@ class FrameAppearance:
     """Standard deviation of log depth."""
     variance: Float32Array
     """Of a difference of colors, but for what an error of depth does."""
+
+    @property
+    def compared(self) -> ComparedFrame:
+        """What others are compared with."""
+        return ComparedFrame(self.color, self.depth.nearest, self.depth.known)
 
 
 def frame_appearance(
@@ -93,7 +110,7 @@ def _depth_arrays(
 
 def moved_evidence(
     source: FrameAppearance,
-    target: FrameAppearance,
+    target: ComparedFrame,
     static: StaticPrediction,
     shared: tuple[Float32Array, Float32Array] | None,
     config: MotionMaskConfig,
@@ -113,7 +130,7 @@ def moved_evidence(
         u, v = u + shared[0], v + shared[1]
     inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
     seen = cv2.remap(target.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    difference = source.color - seen
+    difference = source.color - seen.astype(np.float32, copy=False)
     sampled = (slice(None, None, _SAMPLE),) * 2
     some = inside[sampled]
     if not some.any():
@@ -131,7 +148,7 @@ def moved_evidence(
 
     nearest, known = (
         cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        for values in (target.depth.nearest, target.depth.known.astype(np.float32))
+        for values in (target.nearest, target.known.astype(np.float32))
     )
     hidden = (known > 0) & (nearest < static.log_z - config.occlusion_margin)
     return np.where(inside & ~hidden, np.clip(evidence, *config.evidence_limits), 0).astype(np.float32)

@@ -42,7 +42,8 @@ def track_evidence(
         (h, w) from -1 (static tracks only) over 0 (none, or undecided) to 1 (moving tracks only).
     """
     moving, static = (
-        _splat(tracks, which, frame, size, scale, config.track_reach_px) for which in (motion.moving, motion.static)
+        spread_tracks(tracks, which, frame, size, scale, config.track_reach_px)
+        for which in (motion.moving, motion.static)
     )
     around = moving + static
     # Seen from the tracks: most pixels may have none.
@@ -51,9 +52,10 @@ def track_evidence(
     return ((moving - static) / (around + undecided)).astype(np.float32)
 
 
-def _splat(
+def spread_tracks(
     tracks: Tracks, which: BoolArray, frame: int, size: tuple[int, int], scale: FloatArray, reach_px: float
 ) -> Float32Array:
+    """Return how many of some tracks (K,) are around each pixel (h, w), as a Gaussian of that reach weighs them."""
     seen = which & tracks.visible[:, frame]
     image = np.zeros(size, np.float32)
     np.add.at(image, working_pixels(tracks.uv[seen, frame], size, scale), np.float32(1))
@@ -67,25 +69,37 @@ def working_pixels(uv: Float32Array, size: tuple[int, int], scale: FloatArray) -
     return np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)
 
 
+def smoothed_evidence(
+    evidence: Float32Array, image: ImageArray, radius_px: float, config: MotionMaskConfig
+) -> Float32Array:
+    """Share evidence (h, w) within surfaces of like color.
+
+    Args:
+        evidence: Log odds at working size.
+        image: (h, w, 3) uint8 at working size.
+        radius_px: How far, working px.
+        config: What a like color is.
+    """
+    guide = np.float32(1 / 255) * image.astype(np.float32)
+    return guided_filter(guide, evidence, max(1, round(radius_px)), config.smoothing_contrast)
+
+
 def moving_region(
-    evidence: Float32Array, image: ImageArray, full_size: tuple[int, int], threshold: float, config: MotionMaskConfig
+    evidence: Float32Array, full_size: tuple[int, int], threshold: float, config: MotionMaskConfig
 ) -> BoolArray:
-    """Smooth evidence within surfaces of like color and take what exceeds the threshold.
+    """Take what exceeds a threshold.
 
     Args:
         evidence: (h, w) log odds at working size.
-        image: (h, w, 3) uint8 at working size.
         full_size: (height, width) of the result.
         threshold: Log odds.
-        config: Smoothing.
+        config: What a small hole is.
 
     Returns:
         (H, W) True where something moves, small holes filled.
     """
     height, width = full_size
-    radius = max(1, round(config.smoothing_px * evidence.shape[1] / width))
-    smooth = guided_filter(np.float32(1 / 255) * image.astype(np.float32), evidence, radius, config.smoothing_contrast)
-    full = np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR))
+    full = np.asarray(cv2.resize(evidence, (width, height), interpolation=cv2.INTER_LINEAR))
     region: BoolArray = full > threshold
     return _fill_holes(region, round(config.min_area_fraction * height * width))
 

@@ -26,6 +26,7 @@ _SEED = 0
 def end_at_colors(
     region: BoolArray,
     image: ImageArray,
+    is_background: BoolArray,
     tracks: Tracks,
     motion: TrackMotion,
     frame: int,
@@ -37,6 +38,7 @@ def end_at_colors(
     Args:
         region: (H, W) True where something moves, by and large.
         image: (h, w, 3) uint8 RGB at working size.
+        is_background: (h, w) where nothing moves, whatever the color.
         tracks: K tracks; around static ones outside the region nothing moves.
         motion: Which of them move.
         frame: The frame.
@@ -56,10 +58,13 @@ def end_at_colors(
     at_rest = np.zeros(size, np.uint8)
     at_rest[working_pixels(tracks.uv[motion.static & tracks.visible[:, frame], frame], size, scale)] = 1
     label[(cv2.dilate(at_rest, disk(config.color_track_px)) > 0) & (small == 0)] = cv2.GC_BGD
+    label[is_background] = cv2.GC_BGD
     part = _around_region(near, config.color_margin_px)
     inside = label[part].copy()
     if _moves(inside).all():  # no other color to tell them from
         return region
+    if not _moves(inside).any():
+        return np.zeros_like(region)
     cv2.setRNGSeed(_SEED)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(np.ascontiguousarray(image[part]), inside, None, *models, 1, cv2.GC_INIT_WITH_MASK)

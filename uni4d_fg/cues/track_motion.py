@@ -2,10 +2,11 @@ r"""Which tracks move: each is compared with the static scene between pairs of i
 
 The residual ``r = z_j - u'(z_i)`` of an observation pair (see :mod:`uni4d_fg.cues.static_scene`) is weighed by
 
-    S = sigma_px^2 I + (sigma_z du')(sigma_z du')^T,
+    S = sigma_px^2 I + S_image + (sigma_z du')(sigma_z du')^T,
 
 so that an error of depth explains what it can explain: motion along the epipolar line, by as much as depth may
-be wrong. Where a track has no depth, sigma_z is large and only the distance from the epipolar line is left.
+be wrong. What the image does not hold in place, ``S_image`` explains (:mod:`uni4d_fg.cues.track_certainty`).
+Where a track has no depth, sigma_z is large and only the distance from the epipolar line is left.
 What all tracks of a pair of frames share (an error of pose or focal length) is fitted robustly by a quadratic
 and taken off first.
 """
@@ -97,6 +98,7 @@ def find_moving_tracks(
     config: MotionMaskConfig,
     known_moving: BoolArray,
     with_shared: bool = True,
+    position_variance: Float32Array | None = None,
 ) -> TrackMotion:
     """Test every track against the static scene.
 
@@ -108,6 +110,8 @@ def find_moving_tracks(
         config: Baselines, sigmas and thresholds.
         known_moving: (K,) tracks to which what all share is not fitted, as a large thing would bend it.
         with_shared: Also return what the tracks share of pairs of frames that are compared but not tested.
+        position_variance: (K, 3) px^2, covariances x x, x y and y y of positions, for what the image does not show of
+            them; None for none.
     """
     num_tracks, num_frames = labelled.tracks.visible.shape
     departures: list[npt.NDArray[np.float32]] = []
@@ -121,7 +125,7 @@ def find_moving_tracks(
         for sign in (-1, 1)
         if 0 <= i + sign * step < num_frames
     ]
-    scene = _TracksByFrame.of(labelled, spread, cameras, known_moving)
+    scene = _TracksByFrame.of(labelled, spread, cameras, known_moving, position_variance)
     for first in range(0, len(pairs), _PAIRS_AT_ONCE):
         some = pairs[first : first + _PAIRS_AT_ONCE]
         seen = [scene.common(*pair, config, tested=abs(pair[1] - pair[0]) in config.track_baselines) for pair in some]
@@ -187,11 +191,14 @@ class _TracksByFrame:
     cameras: Cameras
     may_rest: BoolArray
     """(K,) False for those that are known to move."""
+    position_variance: Float32Array
+    """(K, 3) px^2."""
 
     @classmethod
     def of(
-        cls, labelled: LabelledTracks, spread: Float32Array, cameras: Cameras, known_moving: BoolArray
-    ) -> _TracksByFrame:
+        cls, labelled: LabelledTracks, spread: Float32Array, cameras: Cameras, known_moving: BoolArray,
+        position_variance: Float32Array | None,
+    ) -> _TracksByFrame:  # fmt: skip
         """Return tracks by frame."""
         return cls(
             np.ascontiguousarray(labelled.tracks.visible.T),
@@ -200,6 +207,7 @@ class _TracksByFrame:
             np.ascontiguousarray(spread.T),
             cameras,
             ~known_moving,
+            np.zeros((len(known_moving), 3), np.float32) if position_variance is None else position_variance,
         )
 
     def common(self, source: int, target: int, config: MotionMaskConfig, tested: bool) -> _CommonMotion:
@@ -229,7 +237,8 @@ class _TracksByFrame:
         residual = uv_target - np.stack((static.u, static.v), axis=1)
         sigma_depth = np.where(known, config.depth_sigma + 0.5 * self.spread[source, seen], config.depthless_sigma)
         du, dv = static.du * sigma_depth, static.dv * sigma_depth
-        variance = (config.track_sigma_px**2 + du * du, du * dv, config.track_sigma_px**2 + dv * dv)
+        own, (xx, xy, yy) = config.track_sigma_px**2, self.position_variance[seen].astype(np.float64).T
+        variance = (own + xx + du * du, xy + du * dv, own + yy + dv * dv)
         return _CommonMotion(seen, uv, residual, variance, thin)
 
 

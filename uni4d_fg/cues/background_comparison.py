@@ -1,0 +1,117 @@
+"""The second look: every frame compared with the background alone, as frames farther away show it.
+
+The first look (:mod:`uni4d_fg.cues.neighbor_comparison`) knows by and large what moves where. Away from there every
+frame shows background, so that a pixel that differs from what many of them show moves; and one that looks like them is
+background even where the image is flat, unless the thing before it has the same color. The first look cannot tell: a
+plain thing that moves by less than its size looks as if it stood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
+from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.cues.appearance import ComparedFrame, FrameAppearance, frame_appearance, moved_evidence
+from uni4d_fg.cues.behind_moving import depth_behind
+from uni4d_fg.cues.frame_comparison import ComparedVideo, FrameComparison
+from uni4d_fg.cues.moving_regions import disk
+
+_AS_FIRST = 0.75
+"""Log odds above the threshold, or below it, by what the first look said, where no frame shows the background."""
+_OF_ALL = 3.0
+"""Times the mean over frames, in which what one frame says is shared by others."""
+
+
+@dataclass(frozen=True)
+class BackgroundFrame:
+    """A frame at working size, (h, w): little enough that many are held."""
+
+    image: ImageArray
+    depth: Float32Array
+    """Of the background, in the unit of the maps."""
+    may_move: BoolArray
+    """What is not background, with a margin."""
+    compared: ComparedFrame
+
+
+class BackgroundComparison(FrameComparison[BackgroundFrame]):
+    """Frames compared with the background of those at ``config.background_baselines`` before and after.
+
+    Args:
+        given: The video.
+        config: Baselines and weights.
+        first_look: T masks (h, w) at working size of what moves by and large, packed by :func:`numpy.packbits`.
+    """
+
+    def __init__(self, given: ComparedVideo, config: MotionMaskConfig, first_look: list[np.ndarray]) -> None:
+        super().__init__(given, config)
+        self._first_look = first_look
+        self._threshold = config.interpolated_threshold if given.is_interpolated else config.threshold
+        self._source: FrameAppearance
+
+    def _moved_at_first(self, frame: int) -> npt.NDArray[np.uint8]:
+        count = self.size[0] * self.size[1]
+        return np.unpackbits(self._first_look[frame], count=count).reshape(self.size)
+
+    def prepared(self, frame: int) -> BackgroundFrame:
+        """Prepare a frame to be compared with."""
+        image = self.image(frame)
+        margin = disk(self.config.background_margin_px)
+        may_move = np.asarray(cv2.dilate(self._moved_at_first(frame), margin) > 0)
+        # Depth of what moves reaches beyond what was found of it.
+        around = cv2.dilate(may_move.astype(np.uint8), disk(self.config.behind_reach_px)) > 0
+        depth = depth_behind(self.depth(frame), np.asarray(around))
+        compared = frame_appearance(image, depth, *self.appearance_settings(frame)).compared
+        color = compared.color.astype(np.uint8)  # as many levels as it has
+        return BackgroundFrame(image, depth, may_move, replace(compared, color=color))
+
+    def begin(self, frame: int) -> None:
+        """Prepare the frame that is compared.
+
+        The color before a background may be any: where the image is flat it differs as it would elsewhere.
+        """
+        given = self.frames[frame]
+        source = frame_appearance(given.image, given.depth, *self.appearance_settings(frame))
+        least = np.float32(3 * self.config.background_contrast**2)
+        self._source = replace(source, contrast=np.maximum(source.contrast, least))
+
+    def pairs(self, frame: int) -> list[tuple[int, int]]:
+        """Return both directions of all baselines."""
+        return [
+            (frame, other)
+            for step in self.config.background_baselines
+            for other in (frame - step, frame + step)
+            if 0 <= other < self.given.video.num_frames
+        ]
+
+    def pair(self, pair: tuple[int, int]) -> Float32Array:
+        """Compare a frame with what another shows of the background; NaN where it shows none."""
+        other = self.frames[pair[1]]
+        static, shared = self.predicted(self._source.z, pair)
+        evidence = moved_evidence(self._source, other.compared, static, shared, self.config)
+        u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
+        if shared is not None:
+            u, v = u + shared[0], v + shared[1]
+        covered = cv2.remap(
+            other.may_move.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(1,)
+        )
+        # What is outside of the other frame, or hidden in it, has no evidence at all.
+        return np.where((covered > 0) | (evidence == 0), np.float32(np.nan), evidence)
+
+    def combined(self, frame: int, said: Iterator[Float32Array]) -> Float32Array:
+        """Take the mean over the frames that show the background, and what the first look said where none does."""
+        total, count = np.zeros(self.size, np.float32), np.zeros(self.size, np.float32)
+        for evidence in (next(said) for _ in self.pairs(frame)):
+            shown = np.isfinite(evidence)
+            total[shown] += evidence[shown]
+            count += shown
+        at_first = np.where(self._moved_at_first(frame) > 0, self._threshold + _AS_FIRST, self._threshold - _AS_FIRST)
+        mean = np.where(count > 0, np.float32(_OF_ALL) * total / np.maximum(count, 1), at_first)
+        tracks = self.track_evidence(frame)
+        return np.asarray(mean + np.float32(self.config.background_track_weight) * tracks, np.float32)

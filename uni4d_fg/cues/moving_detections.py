@@ -1,0 +1,67 @@
+"""From frames that are compared to regions that move: a first look by and large, and a second for where they end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from uni4d_fg.arrays import BoolArray, Float32Array
+from uni4d_fg.config.motion_masks import MotionMaskConfig
+from uni4d_fg.cues.background_comparison import BackgroundComparison
+from uni4d_fg.cues.detections import FrameDetections
+from uni4d_fg.cues.frame_comparison import ComparedVideo
+from uni4d_fg.cues.moving_regions import grown, moving_region, smoothed_evidence, trusted_components
+from uni4d_fg.cues.neighbor_comparison import NeighborComparison
+from uni4d_fg.cues.region_colors import end_at_colors
+
+PackedMask = npt.NDArray[np.uint8]
+"""A mask (h, w) at working size, packed by :func:`numpy.packbits`."""
+
+
+def first_look(
+    given: ComparedVideo, config: MotionMaskConfig, stop: Callable[[], bool]
+) -> Generator[PackedMask, None, None]:
+    """Yield by and large what moves, frame by frame.
+
+    Raises:
+        Cancelled: If ``stop`` turned true.
+    """
+    comparison = NeighborComparison(given, config)
+    for frame, evidence in enumerate(comparison.evidence(stop)):
+        smooth = smoothed_evidence(
+            evidence, comparison.frames[frame].image, config.smoothing_px * comparison.scale[0], config
+        )
+        region = _trusted(_above_threshold(smooth, given, config), frame, given, config).any(axis=0)
+        small = cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST)
+        yield np.packbits(small)
+
+
+def second_look(
+    given: ComparedVideo, config: MotionMaskConfig, first: list[PackedMask], stop: Callable[[], bool]
+) -> Generator[FrameDetections, None, None]:
+    """Yield the regions that move, frame by frame, from what the first look found in the T frames.
+
+    Raises:
+        Cancelled: If ``stop`` turned true.
+    """
+    comparison = BackgroundComparison(given, config, first)
+    radius = config.background_smoothing_px * comparison.scale[0]
+    for frame, evidence in enumerate(comparison.evidence(stop)):
+        image = comparison.frames[frame].image
+        smooth = smoothed_evidence(evidence, image, radius, config)
+        region = np.asarray(_trusted(_above_threshold(smooth, given, config), frame, given, config).any(axis=0))
+        region = end_at_colors(region, image, smooth < 0, given.tracks, given.motion, frame, comparison.scale, config)
+        masks = grown(_trusted(region, frame, given, config), config.grow_px)
+        yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
+
+
+def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:
+    threshold = config.interpolated_threshold if given.is_interpolated else config.threshold
+    return moving_region(smooth, given.video.image_size, threshold, config)
+
+
+def _trusted(region: BoolArray, frame: int, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:
+    return trusted_components(region, given.tracks, given.motion, frame, config)
