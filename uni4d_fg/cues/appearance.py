@@ -79,7 +79,7 @@ def frame_appearance(
         edge_window_px: Side of the window in which depth may be displaced.
         config: Blur and windows.
     """
-    color = cv2.GaussianBlur(image, (0, 0), config.blur_px).astype(np.float32)
+    color = _blurred(image, config).astype(np.float32)
     gx, gy = (cv2.Sobel(color, -1, 1 - axis, axis, ksize=3) / 8 for axis in (0, 1))
     window = (config.contrast_window_px, config.contrast_window_px)
     variance = cv2.boxFilter(color * color, -1, window) - cv2.boxFilter(color, -1, window) ** 2
@@ -93,6 +93,22 @@ def frame_appearance(
     )
 
 
+def compared_frame(
+    image: ImageArray, depth: Float32Array, log_scale: float, edge_window_px: int, config: MotionMaskConfig
+) -> ComparedFrame:
+    """Prepare only what others are compared with; the arguments are those of :func:`frame_appearance`."""
+    around = _depth_around(depth, log_scale, edge_window_px)
+    return ComparedFrame(_blurred(image, config), around.nearest, around.known)
+
+
+def _blurred(image: ImageArray, config: MotionMaskConfig) -> ImageArray:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), config.blur_px), np.uint8)
+
+
+def _depth_around(depth: Float32Array, log_scale: float, edge_window_px: int) -> DepthRange:
+    return depth_range(depth * np.float32(np.exp(log_scale)), edge_window_px)
+
+
 def with_other_depth(
     frame: FrameAppearance, depth: Float32Array, log_scale: float, edge_window_px: int, config: MotionMaskConfig
 ) -> FrameAppearance:
@@ -104,7 +120,7 @@ def with_other_depth(
 def _depth_arrays(
     depth: Float32Array, log_scale: float, edge_window_px: int, config: MotionMaskConfig
 ) -> tuple[DepthRange, Float32Array, Float32Array]:
-    around = depth_range(depth * np.float32(np.exp(log_scale)), edge_window_px)
+    around = _depth_around(depth, log_scale, edge_window_px)
     return around, np.exp(around.log_depth), config.depth_sigma + 0.5 * around.spread
 
 
@@ -112,7 +128,6 @@ def moved_evidence(
     source: FrameAppearance,
     target: ComparedFrame,
     static: StaticPrediction,
-    shared: tuple[Float32Array, Float32Array] | None,
     config: MotionMaskConfig,
 ) -> Float32Array:
     """Return the log odds (h, w) that a pixel of ``source`` is not where a static scene has it in ``target``.
@@ -121,13 +136,10 @@ def moved_evidence(
         source: Frame the evidence is for.
         target: Frame it is compared with.
         static: Where a static scene has its pixels (h, w), px at working size.
-        shared: Displacements (h, w) in x and y that errors of the cameras cause, px at working size; None for none.
         config: Sigmas.
     """
     height, width = source.contrast.shape
     u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
-    if shared is not None:
-        u, v = u + shared[0], v + shared[1]
     inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
     seen = cv2.remap(target.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = source.color - seen.astype(np.float32, copy=False)

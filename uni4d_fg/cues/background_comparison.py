@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
-from uni4d_fg.cues.appearance import ComparedFrame, FrameAppearance, frame_appearance, moved_evidence
+from uni4d_fg.cues.appearance import ComparedFrame, FrameAppearance, compared_frame, frame_appearance, moved_evidence
 from uni4d_fg.cues.behind_moving import depth_behind
 from uni4d_fg.cues.frame_comparison import ComparedVideo, FrameComparison
 from uni4d_fg.cues.moving_regions import disk
@@ -52,7 +52,7 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
     def __init__(self, given: ComparedVideo, config: MotionMaskConfig, first_look: list[np.ndarray]) -> None:
         super().__init__(given, config)
         self._first_look = first_look
-        self._threshold = config.interpolated_threshold if given.is_interpolated else config.threshold
+        self._threshold = given.threshold(config)
         self._source: FrameAppearance
 
     def _moved_at_first(self, frame: int) -> npt.NDArray[np.uint8]:
@@ -67,9 +67,7 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
         # Depth of what moves reaches beyond what was found of it.
         around = cv2.dilate(may_move.astype(np.uint8), disk(self.config.behind_reach_px)) > 0
         depth = depth_behind(self.depth(frame), np.asarray(around))
-        compared = frame_appearance(image, depth, *self.appearance_settings(frame)).compared
-        color = compared.color.astype(np.uint8)  # as many levels as it has
-        return BackgroundFrame(image, depth, may_move, replace(compared, color=color))
+        return BackgroundFrame(image, depth, may_move, compared_frame(image, depth, *self.appearance_settings(frame)))
 
     def begin(self, frame: int) -> None:
         """Prepare the frame that is compared.
@@ -93,11 +91,9 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
     def pair(self, pair: tuple[int, int]) -> Float32Array:
         """Compare a frame with what another shows of the background; NaN where it shows none."""
         other = self.frames[pair[1]]
-        static, shared = self.predicted(self._source.z, pair)
-        evidence = moved_evidence(self._source, other.compared, static, shared, self.config)
+        static = self.predicted(self._source.z, pair)
+        evidence = moved_evidence(self._source, other.compared, static, self.config)
         u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
-        if shared is not None:
-            u, v = u + shared[0], v + shared[1]
         covered = cv2.remap(
             other.may_move.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(1,)
         )

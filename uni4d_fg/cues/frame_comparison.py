@@ -24,7 +24,6 @@ from uni4d_fg.optim.threads import OrderedMap, thread_count, workers_in_order
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
 
-Displacement = tuple[Float32Array, Float32Array]
 PreparedT = TypeVar("PreparedT")
 
 
@@ -42,6 +41,10 @@ class ComparedVideo:
     camera: CameraModel
     is_interpolated: bool
     """Depth is that of points of the static scene, and knows nothing of what moves."""
+
+    def threshold(self, config: MotionMaskConfig) -> float:
+        """Return the log odds above which a pixel moves."""
+        return config.interpolated_threshold if self.is_interpolated else config.threshold
 
 
 class FrameComparison(ABC, Generic[PreparedT]):
@@ -103,16 +106,17 @@ class FrameComparison(ABC, Generic[PreparedT]):
         self.begin(frame)
         return mapped(self.pair, pairs)
 
-    def predicted(self, z: Float32Array, pair: tuple[int, int]) -> tuple[StaticPrediction, Displacement | None]:
-        """Return where a static scene has pixels of depth z (h, w), and what errors of the cameras add to that."""
+    def predicted(self, z: Float32Array, pair: tuple[int, int]) -> StaticPrediction:
+        """Return where a static scene has pixels of depth z (h, w), with what errors of the cameras add to that."""
         source, target = pair
-        error = self.given.motion.shared.get(pair)
-        shared = None
-        if error is not None:
-            plain = self.pixels.camera.is_plain
-            shared = self.grid.displacement(error) if plain else self.pixels.displacement(error, source, target)
         pose = relative_pose(self.given.cameras.world_T_cam, source, target)
-        return self.pixels.predict(z, pose, source, target), shared
+        static = self.pixels.predict(z, pose, source, target)
+        error = self.given.motion.shared.get(pair)
+        if error is None:
+            return static
+        plain = self.pixels.camera.is_plain
+        x, y = self.grid.displacement(error) if plain else self.pixels.displacement(error, source, target)
+        return replace(static, u=np.asarray(static.u, np.float32) + x, v=np.asarray(static.v, np.float32) + y)
 
     def image(self, frame: int) -> ImageArray:
         """Return a frame (h, w, 3) at working size."""

@@ -59,8 +59,7 @@ def second_look(
 
 
 def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:
-    threshold = config.interpolated_threshold if given.is_interpolated else config.threshold
-    return moving_region(smooth, given.video.image_size, threshold, config)
+    return moving_region(smooth, given.video.image_size, given.threshold(config), config)
 
 
 def _trusted(region: BoolArray, frame: int, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:

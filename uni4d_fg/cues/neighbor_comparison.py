@@ -62,7 +62,7 @@ class NeighborComparison(FrameComparison[NeighborFrame]):
             ours, theirs = one.appearance, other.appearance
         else:
             ours, theirs = one.behind, other.behind
-        return moved_evidence(ours, theirs.compared, *self.predicted(ours.z, pair), self.config)
+        return moved_evidence(ours, theirs.compared, self.predicted(ours.z, pair), self.config)
 
     def combined(self, frame: int, said: Iterator[Float32Array]) -> Float32Array:
         """Add up the baselines and what the tracks say."""
