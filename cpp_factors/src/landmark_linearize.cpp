@@ -34,7 +34,7 @@ struct GroupArrays {
         count(chunk.groups.size()) {}
 };
 
-template <bool kDepth>
+template <int kBytes, bool kDepth>
 UNI4D_FG_INLINE void energies(const PassInput& in, const LandmarkChunk& chunk, double* reprojection, double* depth) {
   const ChunkPoints points(chunk, in.state.landmarks);
   const Intrinsics k = load_intrinsics(in.state.intrinsics);
@@ -42,37 +42,38 @@ UNI4D_FG_INLINE void energies(const PassInput& in, const LandmarkChunk& chunk, d
   for (std::size_t i = 0; i < groups.count; ++i) {
     const RecordGroup& group = groups.groups[i];
     const double* data = groups.data + i * kFields * kSimd8Width;
-    const SimdPoint p = gather_points(points.xyz, groups.lane_landmark + i * kSimd8Width);
-    const SimdPoint x = to_camera(in.state.world_T_cam + 16 * group.frame, p);
-    const SimdDepth z = guarded_depth(x.z);
-    const Simd8 g = inverse_depth(z);
-    const Simd8 u = (field(data, kU) - (k.fx * x.x * g + k.cx)) * field(data, kInverseSigmaU);
-    const Simd8 v = (field(data, kV) - (k.fy * x.y * g + k.cy)) * field(data, kInverseSigmaV);
-    const Simd8 robust = rho(in.reprojection_kernels[group.reprojection], u * u + v * v);
-    Simd8 total = load_simd8(reprojection + group.reprojection * kSimd8Width);
-    total += field(data, kWeight) * robust;
-    store_simd8(total, reprojection + group.reprojection * kSimd8Width);
+    const SimdPoint<kBytes> p = gather_points<kBytes>(points.xyz, groups.lane_landmark + i * kSimd8Width);
+    const SimdPoint<kBytes> x = to_camera(in.state.world_T_cam + 16 * group.frame, p);
+    const SimdDepth<kBytes> z = guarded_depth(x.z);
+    const Simd8<kBytes> g = inverse_depth(z);
+    const Simd8<kBytes> u = (field<kBytes>(data, kU) - (k.fx * x.x * g + k.cx)) * field<kBytes>(data, kInverseSigmaU);
+    const Simd8<kBytes> v = (field<kBytes>(data, kV) - (k.fy * x.y * g + k.cy)) * field<kBytes>(data, kInverseSigmaV);
+    const Simd8<kBytes> robust = rho(in.reprojection_kernels[group.reprojection], u * u + v * v);
+    Simd8<kBytes> total = load<Simd8<kBytes>>(reprojection + group.reprojection * kSimd8Width);
+    total += field<kBytes>(data, kWeight) * robust;
+    store(total, reprojection + group.reprojection * kSimd8Width);
     if constexpr (kDepth) {
-      const Simd8 r =
-          (log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) * field(data, kInverseSigmaDepth);
-      total = load_simd8(depth + group.depth * kSimd8Width);
-      total += field(data, kDepthWeight) * rho(in.depth_kernels[group.depth], r * r);
-      store_simd8(total, depth + group.depth * kSimd8Width);
+      const Simd8<kBytes> r = (log_depth(z) - field<kBytes>(data, kLogDepth) - in.state.log_scale[group.frame]) *
+                              field<kBytes>(data, kInverseSigmaDepth);
+      total = load<Simd8<kBytes>>(depth + group.depth * kSimd8Width);
+      total += field<kBytes>(data, kDepthWeight) * rho(in.depth_kernels[group.depth], r * r);
+      store(total, depth + group.depth * kSimd8Width);
     }
   }
 }
 
 /// base + a * b, or base alone where no batch has a third row.
-template <bool kDepth>
-UNI4D_FG_INLINE Simd8 plus(const Simd8& base, const Simd8& a, const Simd8& b) {
+template <bool kDepth, int kBytes>
+UNI4D_FG_INLINE Simd8<kBytes> plus(const Simd8<kBytes>& base, const Simd8<kBytes>& a, const Simd8<kBytes>& b) {
   if constexpr (kDepth) return base + a * b;
   (void)a, (void)b;
   return base;
 }
 
-UNI4D_FG_INLINE void add(double* sums, int place, const Simd8& value) {
+template <int kBytes>
+UNI4D_FG_INLINE void add(double* sums, int place, const Simd8<kBytes>& value) {
   double* at = sums + place * kSimd8Width;
-  store_simd8(load_simd8(at) + value, at);
+  store(load<Simd8<kBytes>>(at) + value, at);
 }
 
 constexpr std::size_t kGroupsAhead = 2;
@@ -85,13 +86,15 @@ struct GroupTargets {
 };
 
 /// Hand row `row` (8 columns, a lane per record) of the coupling blocks to their pairs.
-UNI4D_FG_INLINE void store_coupling(const GroupTargets& targets, const Simd8* columns, int row, double* coupling) {
-  Simd8 records[kSimd8Width];
+template <int kBytes>
+UNI4D_FG_INLINE void store_coupling(const GroupTargets& targets, const Simd8<kBytes>* columns, int row,
+                                    double* coupling) {
+  Simd8<kBytes> records[kSimd8Width];
   transpose(columns, records);
   for (int lane = 0; lane < kSimd8Width; ++lane) {
     if (lane >= targets.group.used) break;
     double* at = coupling + static_cast<std::size_t>(targets.pair[lane]) * kWidth + row * kSimd8Width;
-    store_simd8(targets.group.first ? records[lane] : load_simd8(at) + records[lane], at);
+    store(targets.group.first ? records[lane] : load<Simd8<kBytes>>(at) + records[lane], at);
   }
 }
 
@@ -103,17 +106,19 @@ UNI4D_FG_INLINE void prefetch_coupling(const int* pair, const double* coupling) 
 }
 
 /// Add eight sums at place `row` of the records' landmarks.
-UNI4D_FG_INLINE void add_to_landmarks(const GroupTargets& targets, const Simd8* columns, int row, double* by_landmark) {
-  Simd8 records[kSimd8Width];
+template <int kBytes>
+UNI4D_FG_INLINE void add_to_landmarks(const GroupTargets& targets, const Simd8<kBytes>* columns, int row,
+                                      double* by_landmark) {
+  Simd8<kBytes> records[kSimd8Width];
   transpose(columns, records);
   for (int lane = 0; lane < kSimd8Width; ++lane) {
     if (lane >= targets.group.used) break;
     double* at = by_landmark + static_cast<std::size_t>(targets.landmark[lane]) * kWidth + row * kSimd8Width;
-    store_simd8(load_simd8(at) + records[lane], at);
+    store(load<Simd8<kBytes>>(at) + records[lane], at);
   }
 }
 
-template <bool kDepth, bool kIntrinsics>
+template <int kBytes, bool kDepth, bool kIntrinsics>
 UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, double* frame_sums, double* coupling,
                                double* landmarks) {
   using namespace frame_sums;
@@ -128,29 +133,30 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
     const double* data = groups.data + i * kFields * kSimd8Width;
     const std::uint8_t* lane_landmark = groups.lane_landmark + i * kSimd8Width;
     const double* m = in.state.world_T_cam + 16 * group.frame;
-    const SimdPoint x = to_camera(m, gather_points(points.xyz, lane_landmark));
-    const SimdDepth z = guarded_depth(x.z);
-    const Simd8 g = inverse_depth(z);
-    const Simd8 xg = x.x * g, yg = x.y * g;
-    const Simd8 isu = field(data, kInverseSigmaU), isv = field(data, kInverseSigmaV);
-    Simd8 ru = (field(data, kU) - (k.fx * xg + k.cx)) * isu;
-    Simd8 rv = (field(data, kV) - (k.fy * yg + k.cy)) * isv;
-    const Simd8 scale =
-        square_root(field(data, kWeight) * weight(in.reprojection_kernels[group.reprojection], ru * ru + rv * rv));
+    const SimdPoint<kBytes> x = to_camera(m, gather_points<kBytes>(points.xyz, lane_landmark));
+    const SimdDepth<kBytes> z = guarded_depth(x.z);
+    const Simd8<kBytes> g = inverse_depth(z);
+    const Simd8<kBytes> xg = x.x * g, yg = x.y * g;
+    const Simd8<kBytes> isu = field<kBytes>(data, kInverseSigmaU), isv = field<kBytes>(data, kInverseSigmaV);
+    Simd8<kBytes> ru = (field<kBytes>(data, kU) - (k.fx * xg + k.cx)) * isu;
+    Simd8<kBytes> rv = (field<kBytes>(data, kV) - (k.fy * yg + k.cy)) * isv;
+    const Simd8<kBytes> scale = square_root(field<kBytes>(data, kWeight) *
+                                            weight(in.reprojection_kernels[group.reprojection], ru * ru + rv * rv));
     ru = ru * scale;
     rv = rv * scale;
     // r = z - pi: the rows of -d pi / d x are (a, 0, b) and (0, c, d).
-    const Simd8 ku = isu * scale, kv = isv * scale;
-    const Simd8 slope = z.inverse * z.inverse;
-    const Simd8 a = -(k.fx * g * ku), b = k.fx * x.x * slope * ku;
-    const Simd8 c = -(k.fy * g * kv), d = k.fy * x.y * slope * kv;
-    const Simd8 ju[5] = {-(b * x.y), b * x.x - a * x.z, a * x.y, -a, -b};
-    const Simd8 jv[5] = {c * x.z - d * x.y, d * x.x, -(c * x.x), -c, -d};
-    Simd8 rd{}, js{}, e{}, jd[3] = {Simd8{}, Simd8{}, Simd8{}};
+    const Simd8<kBytes> ku = isu * scale, kv = isv * scale;
+    const Simd8<kBytes> slope = z.inverse * z.inverse;
+    const Simd8<kBytes> a = -(k.fx * g * ku), b = k.fx * x.x * slope * ku;
+    const Simd8<kBytes> c = -(k.fy * g * kv), d = k.fy * x.y * slope * kv;
+    const Simd8<kBytes> ju[5] = {-(b * x.y), b * x.x - a * x.z, a * x.y, -a, -b};
+    const Simd8<kBytes> jv[5] = {c * x.z - d * x.y, d * x.x, -(c * x.x), -c, -d};
+    Simd8<kBytes> rd{}, js{}, e{}, jd[3] = {Simd8<kBytes>{}, Simd8<kBytes>{}, Simd8<kBytes>{}};
     if constexpr (kDepth) {
-      const Simd8 isd = field(data, kInverseSigmaDepth);
-      rd = (log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) * isd;
-      const Simd8 scale_depth = square_root(field(data, kDepthWeight) * weight(in.depth_kernels[group.depth], rd * rd));
+      const Simd8<kBytes> isd = field<kBytes>(data, kInverseSigmaDepth);
+      rd = (log_depth(z) - field<kBytes>(data, kLogDepth) - in.state.log_scale[group.frame]) * isd;
+      const Simd8<kBytes> scale_depth =
+          square_root(field<kBytes>(data, kDepthWeight) * weight(in.depth_kernels[group.depth], rd * rd));
       rd = rd * scale_depth;
       js = -(isd * scale_depth);
       e = -(z.inverse * js);
@@ -192,7 +198,7 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
       add(sums, kScale, js * js);
       add(sums, kScale + 1, js * rd);
     }
-    const Simd8 jfx = -(xg * ku), jcx = -ku, jfy = -(yg * kv), jcy = -kv;
+    const Simd8<kBytes> jfx = -(xg * ku), jcx = -ku, jfy = -(yg * kv), jcy = -kv;
     if constexpr (kIntrinsics) {
       for (int j = 0; j < 5; ++j) {
         add(sums, kPoseU + 2 * j, ju[j] * jfx);
@@ -213,7 +219,7 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
     }
     if (chunk.frozen) continue;
 
-    Simd8 lu[3], lv[3], ld[3];
+    Simd8<kBytes> lu[3], lv[3], ld[3];
     for (int j = 0; j < 3; ++j) {
       lu[j] = a * m[4 * j] + b * m[4 * j + 2];
       lv[j] = c * m[4 * j + 1] + d * m[4 * j + 2];
@@ -221,24 +227,24 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
     }
     const GroupTargets targets{group, lane_landmark, groups.lane_pair + i * kSimd8Width};
     for (int j = 0; j < 3; ++j) {
-      Simd8 columns[kSimd8Width] = {plus<kDepth>(lu[j] * ju[0] + lv[j] * jv[0], ld[j], jd[0]),
-                                    plus<kDepth>(lu[j] * ju[1] + lv[j] * jv[1], ld[j], jd[1]),
-                                    lu[j] * ju[2] + lv[j] * jv[2],
-                                    lu[j] * ju[3],
-                                    lv[j] * jv[3],
-                                    plus<kDepth>(lu[j] * ju[4] + lv[j] * jv[4], ld[j], jd[2]),
-                                    Simd8{},
-                                    Simd8{}};
+      Simd8<kBytes> columns[kSimd8Width] = {plus<kDepth>(lu[j] * ju[0] + lv[j] * jv[0], ld[j], jd[0]),
+                                            plus<kDepth>(lu[j] * ju[1] + lv[j] * jv[1], ld[j], jd[1]),
+                                            lu[j] * ju[2] + lv[j] * jv[2],
+                                            lu[j] * ju[3],
+                                            lv[j] * jv[3],
+                                            plus<kDepth>(lu[j] * ju[4] + lv[j] * jv[4], ld[j], jd[2]),
+                                            Simd8<kBytes>{},
+                                            Simd8<kBytes>{}};
       if constexpr (kDepth) columns[6] = ld[j] * js;
       store_coupling(targets, columns, j, coupling);
     }
     // V, the gradient, and the coupling to the intrinsics: 24 sums in the order of LandmarkSystem::landmarks_.
-    Simd8 point[kWidth];
+    Simd8<kBytes> point[kWidth];
     int place = 0;
     for (int j = 0; j < 3; ++j)
       for (int n = j; n < 3; ++n) point[place++] = plus<kDepth>(lu[j] * lu[n] + lv[j] * lv[n], ld[j], ld[n]);
     for (int j = 0; j < 3; ++j) point[6 + j] = plus<kDepth>(lu[j] * ru + lv[j] * rv, ld[j], rd);
-    for (int j = 9; j < kWidth; ++j) point[j] = Simd8{};
+    for (int j = 9; j < kWidth; ++j) point[j] = Simd8<kBytes>{};
     if constexpr (kIntrinsics) {
       for (int j = 0; j < 3; ++j) {
         point[9 + 4 * j] = lu[j] * jfx;
@@ -257,20 +263,19 @@ UNI4D_FG_INLINE void linearize(const PassInput& in, const LandmarkChunk& chunk, 
 
 }  // namespace
 
-UNI4D_FG_WIDE_CLONES void energies_plain(const PassInput& in, const LandmarkChunk& chunk, double* reprojection) {
-  energies<false>(in, chunk, reprojection, nullptr);
-}
+UNI4D_FG_DISPATCH(void, energies_plain, (const PassInput& in, const LandmarkChunk& chunk, double* reprojection),
+                  (in, chunk, reprojection), energies<kBytes, false>(in, chunk, reprojection, nullptr))
 
-UNI4D_FG_WIDE_CLONES void energies_depth(const PassInput& in, const LandmarkChunk& chunk, double* reprojection,
-                                         double* depth) {
-  energies<true>(in, chunk, reprojection, depth);
-}
+UNI4D_FG_DISPATCH(void, energies_depth,
+                  (const PassInput& in, const LandmarkChunk& chunk, double* reprojection, double* depth),
+                  (in, chunk, reprojection, depth), energies<kBytes, true>(in, chunk, reprojection, depth))
 
-#define UNI4D_FG_LINEARIZE(name, depth, intrinsics)                                                               \
-  UNI4D_FG_WIDE_CLONES void name(const PassInput& in, const LandmarkChunk& chunk, double* sums, double* coupling, \
-                                 double* landmarks) {                                                             \
-    linearize<depth, intrinsics>(in, chunk, sums, coupling, landmarks);                                           \
-  }
+#define UNI4D_FG_LINEARIZE(name, depth, intrinsics)                                                         \
+  UNI4D_FG_DISPATCH(                                                                                        \
+      void, name,                                                                                           \
+      (const PassInput& in, const LandmarkChunk& chunk, double* sums, double* coupling, double* landmarks), \
+      (in, chunk, sums, coupling, landmarks),                                                               \
+      linearize<kBytes, depth, intrinsics>(in, chunk, sums, coupling, landmarks))
 UNI4D_FG_LINEARIZE(linearize_plain, false, false)
 UNI4D_FG_LINEARIZE(linearize_depth, true, false)
 UNI4D_FG_LINEARIZE(linearize_intrinsics, false, true)

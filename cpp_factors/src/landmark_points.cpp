@@ -32,7 +32,7 @@ UNI4D_FG_INLINE bool any_of(std::uint64_t landmarks, const std::uint8_t* lane_la
 }
 
 /// Sum up the landmarks `wanted`, a bit each, at `points` (64, 3), into `sums` (64, kPointSums). Others are spoiled.
-template <bool kDepth>
+template <int kBytes, bool kDepth>
 UNI4D_FG_INLINE void sum_points(const PassInput& in, const LandmarkChunk& chunk, const double* points,
                                 std::uint64_t wanted, double* sums) {
   std::fill_n(sums, kChunkLandmarks * kPointSums, 0.0);
@@ -47,40 +47,40 @@ UNI4D_FG_INLINE void sum_points(const PassInput& in, const LandmarkChunk& chunk,
     if (!any_of(wanted, lane_landmark, group.used)) continue;
     const double* data = all_data + i * kFields * kSimd8Width;
     const double* m = in.state.world_T_cam + 16 * group.frame;
-    const SimdPoint x = to_camera(m, gather_points(points, lane_landmark));
-    const SimdDepth z = guarded_depth(x.z);
-    const Simd8 g = inverse_depth(z);
-    const Simd8 isu = field(data, kInverseSigmaU), isv = field(data, kInverseSigmaV);
-    const Simd8 ru = (field(data, kU) - (k.fx * x.x * g + k.cx)) * isu;
-    const Simd8 rv = (field(data, kV) - (k.fy * x.y * g + k.cy)) * isv;
+    const SimdPoint<kBytes> x = to_camera(m, gather_points<kBytes>(points, lane_landmark));
+    const SimdDepth<kBytes> z = guarded_depth(x.z);
+    const Simd8<kBytes> g = inverse_depth(z);
+    const Simd8<kBytes> isu = field<kBytes>(data, kInverseSigmaU), isv = field<kBytes>(data, kInverseSigmaV);
+    const Simd8<kBytes> ru = (field<kBytes>(data, kU) - (k.fx * x.x * g + k.cx)) * isu;
+    const Simd8<kBytes> rv = (field<kBytes>(data, kV) - (k.fy * x.y * g + k.cy)) * isv;
     const Kernel& kernel = in.reprojection_kernels[group.reprojection];
-    const Simd8 squared = ru * ru + rv * rv;
-    const Simd8 w = field(data, kWeight) * weight(kernel, squared);
-    Simd8 energy = field(data, kWeight) * rho(kernel, squared);
-    const Simd8 along = kKernelCurvature * w * falloff(kernel, squared) / larger(squared, 1e-300);
+    const Simd8<kBytes> squared = ru * ru + rv * rv;
+    const Simd8<kBytes> w = field<kBytes>(data, kWeight) * weight(kernel, squared);
+    Simd8<kBytes> energy = field<kBytes>(data, kWeight) * rho(kernel, squared);
+    const Simd8<kBytes> along = kKernelCurvature * w * falloff(kernel, squared) / larger(squared, 1e-300);
     // Rows of d r / d x are (a, 0, b) and (0, c, d), as in linearize.
-    const Simd8 slope = z.inverse * z.inverse;
-    const Simd8 a = -(k.fx * g * isu), b = k.fx * x.x * slope * isu;
-    const Simd8 c = -(k.fy * g * isv), d = k.fy * x.y * slope * isv;
-    Simd8 rd{}, wd{}, wd_curved{}, e{};
+    const Simd8<kBytes> slope = z.inverse * z.inverse;
+    const Simd8<kBytes> a = -(k.fx * g * isu), b = k.fx * x.x * slope * isu;
+    const Simd8<kBytes> c = -(k.fy * g * isv), d = k.fy * x.y * slope * isv;
+    Simd8<kBytes> rd{}, wd{}, wd_curved{}, e{};
     if constexpr (kDepth) {
-      const Simd8 isd = field(data, kInverseSigmaDepth);
-      rd = (log_depth(z) - field(data, kLogDepth) - in.state.log_scale[group.frame]) * isd;
+      const Simd8<kBytes> isd = field<kBytes>(data, kInverseSigmaDepth);
+      rd = (log_depth(z) - field<kBytes>(data, kLogDepth) - in.state.log_scale[group.frame]) * isd;
       const Kernel& depth_kernel = in.depth_kernels[group.depth];
-      const Simd8 squared_depth = rd * rd;
-      wd = field(data, kDepthWeight) * weight(depth_kernel, squared_depth);
+      const Simd8<kBytes> squared_depth = rd * rd;
+      wd = field<kBytes>(data, kDepthWeight) * weight(depth_kernel, squared_depth);
       wd_curved = wd * (1.0 - kKernelCurvature * falloff(depth_kernel, squared_depth));
-      energy = energy + field(data, kDepthWeight) * rho(depth_kernel, squared_depth);
+      energy = energy + field<kBytes>(data, kDepthWeight) * rho(depth_kernel, squared_depth);
       e = z.inverse * isd;
     }
-    Simd8 lu[3], lv[3], ld[3], pull[3];
+    Simd8<kBytes> lu[3], lv[3], ld[3], pull[3];
     for (int j = 0; j < 3; ++j) {
       lu[j] = a * m[4 * j] + b * m[4 * j + 2];
       lv[j] = c * m[4 * j + 1] + d * m[4 * j + 2];
       ld[j] = e * m[4 * j + 2];
       pull[j] = lu[j] * ru + lv[j] * rv;
     }
-    Simd8 columns[2 * kSimd8Width];
+    Simd8<kBytes> columns[2 * kSimd8Width];
     int place = 0;
     for (int j = 0; j < 3; ++j)
       for (int n = j; n < 3; ++n) {
@@ -93,20 +93,20 @@ UNI4D_FG_INLINE void sum_points(const PassInput& in, const LandmarkChunk& chunk,
       if constexpr (kDepth) columns[6 + j] += wd * rd * ld[j];
     }
     columns[kEnergy] = energy;
-    for (int j = kEnergy + 1; j < kPointSums; ++j) columns[j] = Simd8{};
-    Simd8 first[kSimd8Width], second[kSimd8Width];
+    for (int j = kEnergy + 1; j < kPointSums; ++j) columns[j] = Simd8<kBytes>{};
+    Simd8<kBytes> first[kSimd8Width], second[kSimd8Width];
     transpose(columns, first);
     transpose(columns + kSimd8Width, second);
     for (int lane = 0; lane < kSimd8Width; ++lane) {
       if (lane >= group.used) break;
       double* at = sums + static_cast<std::size_t>(lane_landmark[lane]) * kPointSums;
-      store_simd8(load_simd8(at) + first[lane], at);
-      store_simd8(load_simd8(at + kSimd8Width) + second[lane], at + kSimd8Width);
+      store(load<Simd8<kBytes>>(at) + first[lane], at);
+      store(load<Simd8<kBytes>>(at + kSimd8Width) + second[lane], at + kSimd8Width);
     }
   }
 }
 
-template <bool kDepth>
+template <int kBytes, bool kDepth>
 UNI4D_FG_INLINE void settle(const PassInput& in, const LandmarkChunk& chunk, DampingBounds bounds, int iterations,
                             double* landmarks) {
   using namespace landmark_cholesky;
@@ -119,7 +119,7 @@ UNI4D_FG_INLINE void settle(const PassInput& in, const LandmarkChunk& chunk, Dam
   std::copy_n(best, 3 * kChunkLandmarks, tried);
   std::fill_n(damping, kChunkLandmarks, kFirstDamping);
   std::uint64_t moving = count == 64 ? ~std::uint64_t{0} : (std::uint64_t{1} << count) - 1;
-  sum_points<kDepth>(in, chunk, best, moving, at_best);
+  sum_points<kBytes, kDepth>(in, chunk, best, moving, at_best);
   for (int iteration = 0; iteration < iterations && moving != 0; ++iteration) {
     for (std::size_t i = 0; i < count; ++i) {
       if ((moving >> i & 1) == 0) continue;
@@ -134,7 +134,7 @@ UNI4D_FG_INLINE void settle(const PassInput& in, const LandmarkChunk& chunk, Dam
       solve_upper(factor, step);
       for (std::size_t k = 0; k < 3; ++k) tried[3 * i + k] = best[3 * i + k] + step[k];
     }
-    sum_points<kDepth>(in, chunk, tried, moving, at_tried);
+    sum_points<kBytes, kDepth>(in, chunk, tried, moving, at_tried);
     for (std::size_t i = 0; i < count; ++i) {
       if ((moving >> i & 1) == 0) continue;
       const double *now = at_tried + i * kPointSums, before = at_best[i * kPointSums + kEnergy];
@@ -157,14 +157,16 @@ UNI4D_FG_INLINE void settle(const PassInput& in, const LandmarkChunk& chunk, Dam
 
 }  // namespace
 
-UNI4D_FG_WIDE_CLONES void settle_points(const PassInput& in, const LandmarkChunk& chunk, const DampingBounds& bounds,
-                                        int iterations, double* landmarks) {
-  settle<false>(in, chunk, bounds, iterations, landmarks);
-}
+UNI4D_FG_DISPATCH(void, settle_points,
+                  (const PassInput& in, const LandmarkChunk& chunk, const DampingBounds& bounds, int iterations,
+                   double* landmarks),
+                  (in, chunk, bounds, iterations, landmarks),
+                  settle<kBytes, false>(in, chunk, bounds, iterations, landmarks))
 
-UNI4D_FG_WIDE_CLONES void settle_points_with_depth(const PassInput& in, const LandmarkChunk& chunk,
-                                                   const DampingBounds& bounds, int iterations, double* landmarks) {
-  settle<true>(in, chunk, bounds, iterations, landmarks);
-}
+UNI4D_FG_DISPATCH(void, settle_points_with_depth,
+                  (const PassInput& in, const LandmarkChunk& chunk, const DampingBounds& bounds, int iterations,
+                   double* landmarks),
+                  (in, chunk, bounds, iterations, landmarks),
+                  settle<kBytes, true>(in, chunk, bounds, iterations, landmarks))
 
 }  // namespace uni4d_fg::landmark_passes

@@ -124,7 +124,7 @@ void LandmarkSystem::energies(const LandmarkState& state, double* out) const {
                                   ? static_cast<std::size_t>(batch)
                                   : reprojections + static_cast<std::size_t>(batch - num_reprojection_);
     out[batch] = 0.0;
-    for (const AlignedDoubles& own : sums) out[batch] += sum(load_simd8(own.data() + place * kSimd8Width));
+    for (const AlignedDoubles& own : sums) out[batch] += sum(load<Simd8<kOwnBytes>>(own.data() + place * kSimd8Width));
   }
 }
 
@@ -203,7 +203,7 @@ void LandmarkSystem::write_camera_blocks(const CameraSystem& system) const {
     double total[kSums] = {};
     for (const AlignedDoubles& own : frame_sums_) {
       const double* sums = own.data() + static_cast<std::size_t>(frame) * kSumWidth;
-      for (int k = 0; k < kSums; ++k) total[k] += sum(load_simd8(sums + k * kSimd8Width));
+      for (int k = 0; k < kSums; ++k) total[k] += sum(load<Simd8<kOwnBytes>>(sums + k * kSimd8Width));
     }
     for (int k = kIntrinsicsU; k < kSums; ++k) intrinsics[k - kIntrinsicsU] += total[k];
     double block[kFrameColumns][kFrameColumns] = {}, gradient[kFrameColumns], border[kFrameColumns][kBorder] = {};
@@ -277,8 +277,8 @@ bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBo
   const auto frames = static_cast<std::size_t>(problem_.num_frames);
   double* border_tiles = tiles + static_cast<std::size_t>(tile_begin_[w][frames]) * kTile;
   int* place = scratch_place_[w].data();
-  const landmark_passes::TileInput input{whitened, border, place, tile_begin_[w].data(), tiles, border_tiles,
-                                         border_tiles + frames * kTile};
+  const landmark_passes::TileInput input{
+      whitened, border, place, tile_begin_[w].data(), tiles, border_tiles, border_tiles + frames * kTile};
   if (!poses_free_) {
     landmark_passes::multiply_scales(chunk, coupling, factors, whitened, input);
     return true;

@@ -101,26 +101,26 @@ UNI4D_FG_INLINE void tile_columns(const Pose& relative, const Intrinsics& k, dou
 
 /// Add the products of one column with itself and the columns after it, summed over the rows of a tile. The sums stay
 /// in registers: hence the parameter pack instead of a loop.
-template <int column, int... after>
+template <int kBytes, int column, int... after>
 UNI4D_FG_INLINE void add_products(const Scratch& a, int rows, double* sums, std::integer_sequence<int, after...>) {
-  Simd4 total[sizeof...(after)] = {};
+  using Value = Simd4<kBytes>;
+  Value total[sizeof...(after)] = {};
   for (int half = 0; half < 2; ++half)
     for (int n = half * kTileRows; n < half * kTileRows + rows; n += kSimd4Width) {
-      Simd4 left, right;
-      load_simd4(&a[column][n], left);
-      ((load_simd4(&a[column + after][n], right), total[after] += left * right), ...);
+      const auto left = load<Value>(&a[column][n]);
+      ((total[after] += left * load<Value>(&a[column + after][n])), ...);
     }
   ((sums[after] += sum(total[after])), ...);
 }
 
 /// Add the Gram matrix of the columns, upper triangle by rows: row `column` has kColumns - column entries.
-template <int column>
+template <int kBytes, int column>
 UNI4D_FG_INLINE void add_gram(const Scratch& a, int rows, double* sums) {
-  add_products<column>(a, rows, sums, std::make_integer_sequence<int, kColumns - column>());
-  if constexpr (column + 1 < kColumns) add_gram<column + 1>(a, rows, sums + kColumns - column);
+  add_products<kBytes, column>(a, rows, sums, std::make_integer_sequence<int, kColumns - column>());
+  if constexpr (column + 1 < kColumns) add_gram<kBytes, column + 1>(a, rows, sums + kColumns - column);
 }
 
-template <KernelKind kind>
+template <int kBytes, KernelKind kind>
 UNI4D_FG_INLINE void tile_sums(const Pose& relative, const Intrinsics& k, double threshold, const TileInput& in,
                                double* sums) {
   alignas(64) Scratch a;
@@ -128,7 +128,7 @@ UNI4D_FG_INLINE void tile_sums(const Pose& relative, const Intrinsics& k, double
   const int padded = (in.rows + kSimd4Width - 1) / kSimd4Width * kSimd4Width;
   for (int n = in.rows; n < padded; ++n)
     for (int j = 0; j < kColumns; ++j) a[j][n] = a[j][kTileRows + n] = 0.0;
-  add_gram<0>(a, padded, sums);
+  add_gram<kBytes, 0>(a, padded, sums);
 }
 
 UNI4D_FG_CLONES double energy_of_tile(const Pose& relative, const Intrinsics& k, const Kernel& kernel,
@@ -148,22 +148,27 @@ UNI4D_FG_CLONES double energy_of_tile(const Pose& relative, const Intrinsics& k,
   }
 }
 
-UNI4D_FG_CLONES void sums_of_tile(const Pose& relative, const Intrinsics& k, const Kernel& kernel, const TileInput& in,
-                                  double* sums) {
+template <int kBytes>
+UNI4D_FG_INLINE void sum_tile(const Pose& relative, const Intrinsics& k, const Kernel& kernel, const TileInput& in,
+                              double* sums) {
   const double c = kernel.threshold;
   switch (kernel.kind) {
     case KernelKind::huber:
-      return tile_sums<KernelKind::huber>(relative, k, c, in, sums);
+      return tile_sums<kBytes, KernelKind::huber>(relative, k, c, in, sums);
     case KernelKind::pseudo_huber:
-      return tile_sums<KernelKind::pseudo_huber>(relative, k, c, in, sums);
+      return tile_sums<kBytes, KernelKind::pseudo_huber>(relative, k, c, in, sums);
     case KernelKind::cauchy:
-      return tile_sums<KernelKind::cauchy>(relative, k, c, in, sums);
+      return tile_sums<kBytes, KernelKind::cauchy>(relative, k, c, in, sums);
     case KernelKind::norm:
-      return tile_sums<KernelKind::norm>(relative, k, c, in, sums);
+      return tile_sums<kBytes, KernelKind::norm>(relative, k, c, in, sums);
     default:
-      return tile_sums<KernelKind::quadratic>(relative, k, c, in, sums);
+      return tile_sums<kBytes, KernelKind::quadratic>(relative, k, c, in, sums);
   }
 }
+
+UNI4D_FG_DISPATCH(void, sums_of_tile,
+                  (const Pose& relative, const Intrinsics& k, const Kernel& kernel, const TileInput& in, double* sums),
+                  (relative, k, kernel, in, sums), sum_tile<kBytes>(relative, k, kernel, in, sums))
 
 }  // namespace
 

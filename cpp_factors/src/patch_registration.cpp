@@ -99,16 +99,19 @@ double load_template(const float* patch, const PatchSettings& settings, Workspac
 }
 
 /// Hessian of the weighted squared differences.
-UNI4D_FG_WIDE_CLONES void hessian(const Workspace& work, double* out) {
-  SimdFloat sums[21];
-  for (SimdFloat& s : sums) s = SimdFloat{};
+template <int kBytes>
+UNI4D_FG_INLINE void sum_hessian(const Workspace& work, double* out) {
+  SimdFloat<kBytes> sums[21];
+  for (SimdFloat<kBytes>& s : sums) s = SimdFloat<kBytes>{};
   for (int b = 0; b < work.blocks; ++b) {
     const auto at = static_cast<std::size_t>(b * kSimdFloatWidth);
-    const SimdFloat x = load_floats(&work.x[at]), y = load_floats(&work.y[at]), w = load_floats(&work.weight[at]);
-    const SimdFloat gx = load_floats(&work.gradient_x[at]), gy = load_floats(&work.gradient_y[at]);
-    const SimdFloat row[kParameters] = {gx, gy, gx * x, gx * y, gy * x, gy * y};
+    const SimdFloat<kBytes> x = load<SimdFloat<kBytes>>(&work.x[at]), y = load<SimdFloat<kBytes>>(&work.y[at]),
+                            w = load<SimdFloat<kBytes>>(&work.weight[at]);
+    const SimdFloat<kBytes> gx = load<SimdFloat<kBytes>>(&work.gradient_x[at]),
+                            gy = load<SimdFloat<kBytes>>(&work.gradient_y[at]);
+    const SimdFloat<kBytes> row[kParameters] = {gx, gy, gx * x, gx * y, gy * x, gy * y};
     for (int i = 0, n = 0; i < kParameters; ++i) {
-      const SimdFloat weighted = w * row[i];
+      const SimdFloat<kBytes> weighted = w * row[i];
       for (int j = 0; j <= i; ++j, ++n) sums[n] += weighted * row[j];
     }
   }
@@ -181,14 +184,16 @@ void sample(const GrayImage& image, const double* warp, Workspace& work) {
 }
 
 /// Weighted means, variances and covariance of what was sampled and of the template, where both are known.
-UNI4D_FG_WIDE_CLONES Moments compare(const Workspace& work) {
-  SimdFloat sums[6];
-  for (SimdFloat& s : sums) s = SimdFloat{};
+template <int kBytes>
+UNI4D_FG_INLINE Moments sum_moments(const Workspace& work) {
+  SimdFloat<kBytes> sums[6];
+  for (SimdFloat<kBytes>& s : sums) s = SimdFloat<kBytes>{};
   for (int b = 0; b < work.blocks; ++b) {
     const auto i = static_cast<std::size_t>(b * kSimdFloatWidth);
-    const SimdFloat w = load_floats(&work.used[i]), value = load_floats(&work.sampled[i]);
-    const SimdFloat first = load_floats(&work.value[i]);
-    const SimdFloat weighted = w * value, other = w * first;
+    const SimdFloat<kBytes> w = load<SimdFloat<kBytes>>(&work.used[i]),
+                            value = load<SimdFloat<kBytes>>(&work.sampled[i]);
+    const SimdFloat<kBytes> first = load<SimdFloat<kBytes>>(&work.value[i]);
+    const SimdFloat<kBytes> weighted = w * value, other = w * first;
     sums[0] += w;
     sums[1] += weighted;
     sums[2] += weighted * value;
@@ -207,18 +212,20 @@ UNI4D_FG_WIDE_CLONES Moments compare(const Workspace& work) {
   return out;
 }
 
-UNI4D_FG_WIDE_CLONES void gradient(const Workspace& work, const Moments& moments, double* out) {
+template <int kBytes>
+UNI4D_FG_INLINE void sum_gradient(const Workspace& work, const Moments& moments, double* out) {
   const auto gain = static_cast<float>(std::sqrt(moments.variance / moments.sampled_variance));
   const auto offset = static_cast<float>(moments.mean - gain * moments.sampled_mean);
-  SimdFloat sums[kParameters];
-  for (SimdFloat& s : sums) s = SimdFloat{};
+  SimdFloat<kBytes> sums[kParameters];
+  for (SimdFloat<kBytes>& s : sums) s = SimdFloat<kBytes>{};
   for (int b = 0; b < work.blocks; ++b) {
     const auto at = static_cast<std::size_t>(b * kSimdFloatWidth);
-    const SimdFloat x = load_floats(&work.x[at]), y = load_floats(&work.y[at]);
-    const SimdFloat difference = gain * load_floats(&work.sampled[at]) - load_floats(&work.value[at]) + offset;
-    const SimdFloat weighted = load_floats(&work.used[at]) * difference;
-    const SimdFloat by_x = weighted * load_floats(&work.gradient_x[at]);
-    const SimdFloat by_y = weighted * load_floats(&work.gradient_y[at]);
+    const SimdFloat<kBytes> x = load<SimdFloat<kBytes>>(&work.x[at]), y = load<SimdFloat<kBytes>>(&work.y[at]);
+    const SimdFloat<kBytes> difference =
+        gain * load<SimdFloat<kBytes>>(&work.sampled[at]) - load<SimdFloat<kBytes>>(&work.value[at]) + offset;
+    const SimdFloat<kBytes> weighted = load<SimdFloat<kBytes>>(&work.used[at]) * difference;
+    const SimdFloat<kBytes> by_x = weighted * load<SimdFloat<kBytes>>(&work.gradient_x[at]);
+    const SimdFloat<kBytes> by_y = weighted * load<SimdFloat<kBytes>>(&work.gradient_y[at]);
     sums[0] += by_x;
     sums[1] += by_y;
     sums[2] += by_x * x;
@@ -228,6 +235,13 @@ UNI4D_FG_WIDE_CLONES void gradient(const Workspace& work, const Moments& moments
   }
   for (int i = 0; i < kParameters; ++i) out[i] = sum(sums[i]);
 }
+
+UNI4D_FG_DISPATCH(void, hessian, (const Workspace& work, double* out), (work, out), sum_hessian<kBytes>(work, out))
+
+UNI4D_FG_DISPATCH(Moments, compare, (const Workspace& work), (work), return sum_moments<kBytes>(work))
+
+UNI4D_FG_DISPATCH(void, gradient, (const Workspace& work, const Moments& moments, double* out), (work, moments, out),
+                  sum_gradient<kBytes>(work, moments, out))
 
 /// Replace a warp W by W o D^{-1} for the step D; returns the moved distance of the center, infinite if there is none.
 double compose(const double* step, double* warp) {

@@ -184,17 +184,26 @@ def adjust_bundle(
     rounds = 2 if energy.is_likelihood and config.measure_noise else 1
     motion = starting_prior(config.acceleration, timestamps, start.world_T_cam, landmarks)
 
-    def declare(noise: StaticNoise, settings: BundleAdjustmentConfig) -> Problem:
+    def declare(
+        state: State, observations: Observations, noise: StaticNoise, settings: BundleAdjustmentConfig
+    ) -> Problem:
         return bundle_adjustment_problem(
             state, observations, noise, settings, prior_intrinsics[None], freedom, energy, acceleration=motion
         )
 
+    def declare_last(state: State, observations: Observations) -> tuple[Stage, State]:
+        """Declare the last solve of some of the landmarks, added factors included."""
+        problem = declare(state, observations, noise, config)
+        joined = joined_by(run, Stage("bundle_adjustment", problem, near_the_minimum(config.solver)), state)
+        return joined.stage, joined.state
+
     for index in range(rounds):
-        problem = declare(*(held_to_the_cue(noise, config) if index < rounds - 1 else (noise, config)))
+        settings = held_to_the_cue(noise, config) if index < rounds - 1 else (noise, config)
+        problem = declare(state, observations, *settings)
         return_free_memory(LARGE)
         if index == 1 and freedom.poses and motion.is_weak:
             motion = estimate_prior(motion, problem, state, config.solver, noise.overstated)
-            problem = declare(noise, config)
+            problem = declare(state, observations, noise, config)
         stage = Stage("bundle_adjustment", problem, config.solver if index == 0 else near_the_minimum(config.solver))
         state, summary = run(stage, state, hooks)
         solves.append(summary)
@@ -207,8 +216,7 @@ def adjust_bundle(
             known_to = None if freedom.intrinsics else focal_sigma
             covariances = _covariances(stage, state, observations, config, run, known_to)
             if known_to:
-                joined = joined_by(run, stage, state)
-                stretched = focal_depth_error(joined.stage, joined.state, observations, known_to, hooks)
+                stretched = focal_depth_error(declare_last, state, observations, known_to, hooks)
         del problem, stage  # as large as the observations, of which the next solve has others
         state, observations = drop_outliers(state, observations, config, dropped)
         if len(observations) == 0:

@@ -6,6 +6,8 @@ out explain the tracks nearly as well: an error of 1 % of the focal length may b
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
@@ -17,13 +19,24 @@ from uni4d_fg.optim.stage import Stage, run_stage, until_converged
 from uni4d_fg.slam.stages.observations import Observations
 
 
+_MOST_OBSERVATIONS = 40_000
+"""Of so many the bend is found: it is one of the whole scene, and solves take as long as there are observations."""
+
+
 def focal_depth_error(
-    stage: Stage, state: State, observations: Observations, focal_sigma: float, hooks: Hooks | None = None
+    declared: Callable[[State, Observations], tuple[Stage, State]],
+    state: State,
+    observations: Observations,
+    focal_sigma: float,
+    hooks: Hooks | None = None,
 ) -> float:
     """Return the mean relative change of depth, one scale apart, as focal lengths grow by a standard deviation.
 
+    Of a large scene it is that of evenly spread tracks. Both ends are minima: far landmarks move by more while a solve
+    converges in full than focal lengths move them.
+
     Args:
-        stage: Bundle adjustment in which the intrinsics are held.
+        declared: Makes bundle adjustment of some landmarks in which the intrinsics are held, and where it starts.
         state: Its minimum.
         observations: Of the state's landmarks.
         focal_sigma: Standard deviation of the log of the focal lengths.
@@ -32,10 +45,18 @@ def focal_depth_error(
     Raises:
         SolverError: If the system is singular.
     """
-    longer = state[INTRINSICS] * np.array([np.exp(focal_sigma)] * 2 + [1.0, 1.0])
+    if len(observations) > _MOST_OBSERVATIONS:
+        _, row = observations.rows()
+        chosen = observations.thinned(_MOST_OBSERVATIONS)
+        observations = observations.select(chosen)
+        landmarks = state[LANDMARK][np.unique(row[chosen])]
+        state = State({**state.arrays, LANDMARK: landmarks}, {**state.index, LANDMARK: observations.rows()[0]})
+    stage, state = declared(state, observations)
     quiet = None if hooks is None else Hooks(should_stop=hooks.should_stop)
-    bent, _ = run_stage(until_converged(stage), state.replace({INTRINSICS: longer}), quiet)
-    change = _log_depth(bent, observations) - _log_depth(state, observations)
+    minimum, _ = run_stage(until_converged(stage), state, quiet)
+    longer = minimum[INTRINSICS] * np.array([np.exp(focal_sigma)] * 2 + [1.0, 1.0])
+    bent, _ = run_stage(until_converged(stage), minimum.replace({INTRINSICS: longer}), quiet)
+    change = _log_depth(bent, observations) - _log_depth(minimum, observations)
     change = change[np.isfinite(change)]
     return float(np.mean(np.abs(change - np.median(change)))) if len(change) else 0.0
 
