@@ -18,7 +18,6 @@ from uni4d_fg.optim.levenberg_marquardt import Hooks
 from uni4d_fg.optim.stage import Stage, run_stage, until_converged
 from uni4d_fg.slam.stages.observations import Observations
 
-
 _MOST_OBSERVATIONS = 40_000
 """Of so many the bend is found: it is one of the whole scene, and solves take as long as there are observations."""
 
