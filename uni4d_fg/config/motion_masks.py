@@ -56,6 +56,10 @@ class MotionMaskConfig(Section):
     )
     background_track_weight: float = setting(2.0, "What ``track_weight`` is in the second look.", ge=0)
     background_smoothing_px: int = setting(8, "What ``smoothing_px`` is in the second look.", ge=1)
+    shadow_window_px: int = setting(
+        15, "Side of the window in which a shadow darkens the background evenly, working px.", ge=3
+    )
+    deepest_shadow: float = setting(0.4, "What is darker than this part of the background is no shadow.", gt=0, le=1)
     first_guess_step: int = setting(
         5, "The first guess of what moves compares frames this far apart by the pose that most tracks agree on.", ge=1
     )

@@ -9,6 +9,10 @@ the variance of the intensities plus what an error of the predicted pixel makes 
 and for one that has moved also the variance ``c^2`` of the image around it. The evidence is the log of the ratio of
 two normal densities with these variances. It vanishes where the image is flat, where depth is unknown and where the
 point is hidden in frame j, and it forgives depth that is off along the epipolar line.
+
+What lies in a shadow in frame i and not in frame j has its colors there times one gain ``a <= 1``, which changes less
+from pixel to pixel than texture does: with ``a`` fitted to a window, the texture that is left tells a shadow from
+another thing. Where there is none, nothing does (plain clothes before a plain wall differ by one gain, too).
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.depth_range import DepthRange, depth_range
 from uni4d_fg.cues.guided_filter import sum_colors
@@ -28,6 +32,8 @@ _MEDIAN_OF_SQUARE = 0.455
 """Of the square of a standard normal variable."""
 _SAMPLE = 4
 """Medians over an image take every fourth pixel in x and y."""
+_LIT = 0.97
+"""What is at least so bright, as a part of what it was, is not in a shadow."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +135,7 @@ def moved_evidence(
     target: ComparedFrame,
     static: StaticPrediction,
     config: MotionMaskConfig,
+    texture: Float32Array | None = None,
 ) -> Float32Array:
     """Return the log odds (h, w) that a pixel of ``source`` is not where a static scene has it in ``target``.
 
@@ -137,6 +144,8 @@ def moved_evidence(
         target: Frame it is compared with.
         static: Where a static scene has its pixels (h, w), px at working size.
         config: Sigmas.
+        texture: Variance of the colors (h, w) around, where a pixel may also be one of the target's in a shadow; None
+            does not look for shadows.
     """
     height, width = source.contrast.shape
     u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
@@ -148,15 +157,19 @@ def moved_evidence(
     if not some.any():
         return np.zeros((height, width), np.float32)
     difference -= np.median(difference[sampled][some], axis=0)  # exposure
-    squared = cv2.boxFilter(sum_colors(difference * difference), -1, (config.patch_px, config.patch_px))
+    squared = _squared(difference, config)
 
     du, dv = source.sigma_depth * static.du, source.sigma_depth * static.dv
     gxx, gxy, gyy = source.gradient
     variance = source.variance + (du * du * gxx + 2 * du * dv * gxy + dv * dv * gyy)
     # Blur and noise of this pair of frames: most of the image is static.
     variance *= max(1.0, float(np.median((squared[sampled] / variance[sampled])[some])) / _MEDIAN_OF_SQUARE)
-    wider = variance + 2 * source.contrast
-    evidence = 0.5 * (squared / variance - squared / wider - np.log(wider / variance))
+    evidence = _log_odds(squared, variance, source.contrast)
+    if texture is not None:
+        rest, shaded = _without_shadow(source.color, difference, config)
+        shaded &= 2 * texture > variance
+        in_shadow = _log_odds(_squared(rest, config), variance, texture)
+        evidence = np.where(shaded, np.minimum(evidence, in_shadow), evidence)
 
     nearest, known = (
         cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
@@ -164,3 +177,27 @@ def moved_evidence(
     )
     hidden = (known > 0) & (nearest < static.log_z - config.occlusion_margin)
     return np.where(inside & ~hidden, np.clip(evidence, *config.evidence_limits), 0).astype(np.float32)
+
+
+def _squared(difference: Float32Array, config: MotionMaskConfig) -> Float32Array:
+    """Return the mean square (h, w) around of a difference of colors (h, w, 3), summed over them."""
+    mean = cv2.boxFilter(sum_colors(difference * difference), -1, (config.patch_px, config.patch_px))
+    return np.asarray(mean, np.float32)
+
+
+def _log_odds(
+    squared: Float32Array, variance: Float32Array | FloatArray, contrast: Float32Array
+) -> Float32Array | FloatArray:
+    wider = variance + 2 * contrast
+    return np.asarray(0.5 * (squared / variance - squared / wider - np.log(wider / variance)))
+
+
+def _without_shadow(
+    color: Float32Array, difference: Float32Array, config: MotionMaskConfig
+) -> tuple[Float32Array, BoolArray]:
+    """Return what a shadow leaves of a difference of colors (h, w, 3), and where one would be (h, w)."""
+    lit, window = color - difference, (config.shadow_window_px, config.shadow_window_px)
+    common, power = (cv2.boxFilter(sum_colors(lit * other), -1, window) for other in (color, lit))
+    gain = common / np.maximum(power, np.float32(1.0))
+    rest = color - np.clip(gain, np.float32(config.deepest_shadow), np.float32(1.0))[..., None] * lit
+    return rest, np.asarray(gain < _LIT)

@@ -3,7 +3,8 @@
 The first look (:mod:`uni4d_fg.cues.neighbor_comparison`) knows by and large what moves where. Away from there every
 frame shows background, so that a pixel that differs from what many of them show moves; and one that looks like them is
 background even where the image is flat, unless the thing before it has the same color. The first look cannot tell: a
-plain thing that moves by less than its size looks as if it stood.
+plain thing that moves by less than its size looks as if it stood. Nor can it tell shadows, which move as well: before
+the background they are the background, darker.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
         self._first_look = first_look
         self._threshold = given.threshold(config)
         self._source: FrameAppearance
+        self._texture: Float32Array
 
     def _moved_at_first(self, frame: int) -> npt.NDArray[np.uint8]:
         count = self.size[0] * self.size[1]
@@ -76,6 +78,7 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
         """
         given = self.frames[frame]
         source = frame_appearance(given.image, given.depth, *self.appearance_settings(frame))
+        self._texture = source.contrast
         least = np.float32(3 * self.config.background_contrast**2)
         self._source = replace(source, contrast=np.maximum(source.contrast, least))
 
@@ -92,7 +95,7 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
         """Compare a frame with what another shows of the background; NaN where it shows none."""
         other = self.frames[pair[1]]
         static = self.predicted(self._source.z, pair)
-        evidence = moved_evidence(self._source, other.compared, static, self.config)
+        evidence = moved_evidence(self._source, other.compared, static, self.config, self._texture)
         u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
         covered = cv2.remap(
             other.may_move.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(1,)
