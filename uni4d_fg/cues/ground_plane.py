@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, rows_by_group
+from uni4d_fg.arrays import BoolArray, FloatArray, IntArray, rows_by_group
 from uni4d_fg.geometry.camera import unproject
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.observations import Observations
 
-_MAX_TILT = 50.0
-"""Largest angle between the ground's normal and the cameras' mean up direction, degrees."""
+_LEVEL = np.cos(np.radians(50.0))
+"""Cosine of the largest angle between the ground's normal and the cameras' mean up direction."""
 _NEAR = 0.015
 """Points that are this far from a plane, as a part of their distance to the nearest camera, lie on it."""
 _MAX_UNDER = 0.05
@@ -27,8 +27,15 @@ _FARTHER = 1.15
 """What is farther than the plane by this factor is seen through it ..."""
 _SEEN_THROUGH = 0.03
 """... and a plane through which more than this part of all is seen is a table."""
-_TRIALS = 3000
-_MAX_POINTS = 3000
+_TRIALS = 20_000
+"""Where a twentieth of the points is ground, two or three of these are three points of it ..."""
+_JUDGED = 1_000
+"""... each judged by so many points ..."""
+_REFINED = 50
+"""... and so many of the best refined: one of three points that are near each other is tilted by their noise."""
+_MAX_POINTS = 10_000
+_AT_ONCE = 1_000
+"""Planes that are judged at once: more take more memory, not less time."""
 _REFINEMENTS = (1.0, 1.0, 0.5, 0.5, 0.5)
 """Parts of that distance within which the ground is fitted again: what stands on it is near its feet only."""
 _THIN = 0.1
@@ -101,38 +108,68 @@ def find_ground(points: FloatArray, distance: FloatArray, world_T_cam: FloatArra
     up = -world_T_cam[:, :3, 1].mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
     centers = world_T_cam[:, :3, 3]
+    best, most = None, 0
+    for plane in _likely(points, near, up, centers, rng):
+        refined = _refined(plane, points, near, up)
+        if refined is None or refined.normal @ up <= _LEVEL or not (centers @ refined.normal > refined.offset).all():
+            continue
+        # By what lies on it as closely as it was fitted: a wider band has more of a wall that it ends at.
+        more = _more_on_it(refined.normal[None], np.array([refined.offset]), points, near, _REFINEMENTS[-1])
+        if more[0] > most:
+            best, most = refined, more[0]
+    if best is None:
+        return None
+    on_it = _on(best, points, near)
+    if np.count_nonzero(on_it) < max(_MIN_ON_IT, _MIN_SHARE * len(points)):
+        return None
+    spread = np.linalg.svd(points[on_it] - points[on_it].mean(axis=0), compute_uv=False)
+    return None if spread[1] < _THIN * spread[0] else best
+
+
+def _likely(
+    points: FloatArray, near: FloatArray, up: FloatArray, centers: FloatArray, rng: np.random.Generator
+) -> list[Plane]:
+    """Return planes through three points each that have most points on them, by a part of the points (N, 3)."""
     triple = points[rng.integers(len(points), size=(_TRIALS, 3))]
     normals = np.cross(triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0])
     length = np.linalg.norm(normals, axis=1)
     fine = length > 1e-12
     normals, corner = normals[fine] / length[fine, None], triple[fine, 0]
     normals *= np.where(normals @ up < 0, -1.0, 1.0)[:, None]
-    level = normals @ up > np.cos(np.radians(_MAX_TILT))
+    level = normals @ up > _LEVEL
     normals, offsets = normals[level], np.sum(normals[level] * corner[level], axis=1)
     above = (normals @ centers.T > offsets[:, None]).all(axis=1)
-    best, most = None, 0
-    for normal, offset in zip(normals[above], offsets[above], strict=True):
-        height = points @ normal - offset
-        under = int(np.count_nonzero(height < -3 * near))
-        if under > _MAX_UNDER * len(points):
-            continue
-        more = int(np.count_nonzero(np.abs(height) < near)) - under
-        if more > most:
-            best, most = Plane(normal, float(offset)), more
-    if best is None:
-        return None
+    normals, offsets = normals[above], offsets[above]
+    some = slice(_JUDGED)
+    more = np.concatenate([
+        _more_on_it(normals[i : i + _AT_ONCE], offsets[i : i + _AT_ONCE], points[some], near[some])
+        for i in range(0, len(normals), _AT_ONCE)
+    ] or [np.zeros(0, np.int64)])  # fmt: skip
+    best = np.argsort(-more, kind="stable")[:_REFINED]
+    return [Plane(normals[i], float(offsets[i])) for i in best.tolist() if more[i] > 0]
+
+
+def _more_on_it(
+    normals: FloatArray, offsets: FloatArray, points: FloatArray, near: FloatArray, part: float = 1.0
+) -> IntArray:
+    """Return how many more points lie on planes (M, 3), (M,) than under them; 0 where too many are under them.
+
+    On a plane is what is as near as this part of ``near`` (N,).
+    """
+    height = normals @ points.T - offsets[:, None]
+    under = np.count_nonzero(height < -3 * near, axis=1)
+    more = np.count_nonzero(np.abs(height) < part * near, axis=1) - under
+    return np.where(under > _MAX_UNDER * len(points), 0, more)
+
+
+def _refined(plane: Plane, points: FloatArray, near: FloatArray, up: FloatArray) -> Plane | None:
+    """Fit a plane to what lies on it, a few times; None if nothing does."""
     for part in _REFINEMENTS:
-        on_it = _on(best, points, part * near)
+        on_it = _on(plane, points, part * near)
         if np.count_nonzero(on_it) < 3:
             return None
-        best = _fitted(points[on_it], near[on_it], up)
-    on_it = _on(best, points, near)
-    if np.count_nonzero(on_it) < max(_MIN_ON_IT, _MIN_SHARE * len(points)):
-        return None
-    spread = np.linalg.svd(points[on_it] - points[on_it].mean(axis=0), compute_uv=False)
-    if spread[1] < _THIN * spread[0] or not (centers @ best.normal > best.offset).all():
-        return None
-    return best
+        plane = _fitted(points[on_it], near[on_it], up)
+    return plane
 
 
 def _on(plane: Plane, points: FloatArray, near: FloatArray) -> BoolArray:

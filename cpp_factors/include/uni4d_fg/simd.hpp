@@ -67,7 +67,9 @@ constexpr int kSimd4Width = 4;
 constexpr int kSimdFloatWidth = 16;
 
 /// Bytes of a register of the processor that all of the code is compiled for; 8 where the compiler has no vectors.
-#if !defined(__GNUC__) && !defined(__clang__)
+#if defined(UNI4D_FG_OWN_BYTES)
+constexpr int kOwnBytes = UNI4D_FG_OWN_BYTES;
+#elif !defined(__GNUC__) && !defined(__clang__)
 constexpr int kOwnBytes = 8;
 #elif defined(__AVX512F__)
 constexpr int kOwnBytes = 64;
