@@ -97,9 +97,9 @@ def _read(path: Path, num_frames: int, size: tuple[int, int]) -> Calibration:
     except SequenceProblem:
         raise
     except InputError as error:  # of the lens
-        raise SequenceProblem(path, f"has no complete calibration ({error})", "export it again") from error
+        raise SequenceProblem(path, f"has no complete calibration ({str(error)[:200]})", "export it again") from error
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise SequenceProblem(path, f"has no complete calibration ({error})", "export it again") from error
+        raise SequenceProblem(path, f"has no complete calibration ({str(error)[:200]})", "export it again") from error
 
 
 def _fitted(path: Path, found: Calibration, size: tuple[int, int]) -> Calibration:
@@ -136,7 +136,9 @@ def _colmap(path: Path) -> Calibration:
         raise SequenceProblem(path, f"has {len(lines)} cameras", "give a cameras.txt with the one camera of the video")
     _, model, width, height, *numbers = lines[0]
     if model not in _COLMAP:
-        raise SequenceProblem(path, f"has the camera model {model}", f"undistort, or use one of {', '.join(_COLMAP)}")
+        raise SequenceProblem(
+            path, f"has the camera model {model[:40]}", f"undistort, or use one of {', '.join(_COLMAP)}"
+        )
     count, ours = _COLMAP[model]
     values = [float(v) for v in numbers]
     if len(values) != count + 2 + _SIZES[ours]:
@@ -183,7 +185,9 @@ def _kalibr(data: Mapping[str, Any], path: Path) -> Calibration:
     kind = data.get("distortion_model", "none")
     if data.get("camera_model", "pinhole") != "pinhole" or kind not in ("radtan", "equidistant", "none"):
         raise SequenceProblem(
-            path, f"has the model {data.get('camera_model')}-{kind}", "use pinhole with radtan or equidistant"
+            path,
+            f"has the model {str(data.get('camera_model'))[:40]}-{str(kind)[:40]}",
+            "use pinhole with radtan or equidistant",
         )
     width, height = (int(v) for v in data["resolution"])
     numbers = [float(v) for v in data.get("distortion_coeffs", [])]
@@ -205,7 +209,7 @@ def _opencv(data: Mapping[str, Any], path: Path) -> Calibration:
     kind = str(data.get("distortion_model", ""))
     fisheye = kind in ("equidistant", "fisheye") or bool(data.get("fisheye_model", 0))
     if kind not in ("", "plumb_bob", "rational_polynomial", "equidistant", "fisheye"):
-        raise SequenceProblem(path, f"has the distortion model {kind}", "use plumb_bob or equidistant")
+        raise SequenceProblem(path, f"has the distortion model {str(kind)[:40]}", "use plumb_bob or equidistant")
     width, height = data.get("image_width"), data.get("image_height")
     size = (int(height), int(width)) if height is not None and width is not None else None
     return Calibration(np.array([k[0], k[4], k[2], k[5]]), _lens(_numbers(numbers), fisheye, path), size)
