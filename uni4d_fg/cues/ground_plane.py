@@ -140,11 +140,10 @@ def _likely(
     normals, offsets = normals[level], np.sum(normals[level] * corner[level], axis=1)
     above = (normals @ centers.T > offsets[:, None]).all(axis=1)
     normals, offsets = normals[above], offsets[above]
-    some = slice(_JUDGED)
-    more = np.concatenate([
-        _more_on_it(normals[i : i + _AT_ONCE], offsets[i : i + _AT_ONCE], points[some], near[some])
-        for i in range(0, len(normals), _AT_ONCE)
-    ] or [np.zeros(0, np.int64)])  # fmt: skip
+    more = np.zeros(len(normals), np.int64)
+    for first in range(0, len(normals), _AT_ONCE):
+        block = slice(first, first + _AT_ONCE)
+        more[block] = _more_on_it(normals[block], offsets[block], points[:_JUDGED], near[:_JUDGED])
     best = np.argsort(-more, kind="stable")[:_REFINED]
     return [Plane(normals[i], float(offsets[i])) for i in best.tolist() if more[i] > 0]
 

@@ -96,9 +96,7 @@ def _read(path: Path, num_frames: int, size: tuple[int, int]) -> Calibration:
         return _fitted(path, found, size)
     except SequenceProblem:
         raise
-    except InputError as error:  # of the lens
-        raise SequenceProblem(path, f"has no complete calibration ({str(error)[:200]})", "export it again") from error
-    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+    except (InputError, LookupError, TypeError, ValueError, ArithmeticError) as error:  # InputError: of the lens
         raise SequenceProblem(path, f"has no complete calibration ({str(error)[:200]})", "export it again") from error
 
 
@@ -209,7 +207,7 @@ def _opencv(data: Mapping[str, Any], path: Path) -> Calibration:
     kind = str(data.get("distortion_model", ""))
     fisheye = kind in ("equidistant", "fisheye") or bool(data.get("fisheye_model", 0))
     if kind not in ("", "plumb_bob", "rational_polynomial", "equidistant", "fisheye"):
-        raise SequenceProblem(path, f"has the distortion model {str(kind)[:40]}", "use plumb_bob or equidistant")
+        raise SequenceProblem(path, f"has the distortion model {kind[:40]}", "use plumb_bob or equidistant")
     width, height = data.get("image_width"), data.get("image_height")
     size = (int(height), int(width)) if height is not None and width is not None else None
     return Calibration(np.array([k[0], k[4], k[2], k[5]]), _lens(_numbers(numbers), fisheye, path), size)

@@ -175,7 +175,8 @@ def adjust_bundle(
         )
     others: Observations | None = None
     if energy.is_likelihood and config.structure == "refine" and len(observations) > config.max_camera_observations:
-        observations, landmarks, others = _for_cameras(observations, landmarks, config)
+        observations, others, rows = observations.parted(config.max_camera_observations)
+        landmarks = landmarks[rows]
     state = start.state(landmarks, observations.rows()[0])
     noise = StaticNoise(config.reprojection_sigma_px, config.depth_sigma, config.depth_correlation)
     solves: list[SolveSummary] = []
@@ -315,12 +316,3 @@ def _covariances(
     if marginals is None:
         return unknown_covariances(len(state[POSE]))
     return marginals.blocks(POSE, len(state[POSE])), marginals.blocks(INTRINSICS, 1)[0]
-
-
-def _for_cameras(
-    observations: Observations, landmarks: FloatArray, config: BundleAdjustmentConfig
-) -> tuple[Observations, FloatArray, Observations]:
-    """Return the observations that find the cameras, their landmarks, and the other observations."""
-    _, row = observations.rows()
-    chosen = observations.thinned(config.max_camera_observations)
-    return observations.select(chosen), landmarks[np.unique(row[chosen])], observations.select(~chosen)

@@ -45,11 +45,9 @@ def focal_depth_error(
         SolverError: If the system is singular.
     """
     if len(observations) > _MOST_OBSERVATIONS:
-        _, row = observations.rows()
-        chosen = observations.thinned(_MOST_OBSERVATIONS)
-        observations = observations.select(chosen)
-        landmarks = state[LANDMARK][np.unique(row[chosen])]
-        state = State({**state.arrays, LANDMARK: landmarks}, {**state.index, LANDMARK: observations.rows()[0]})
+        observations, rows = observations.parted(_MOST_OBSERVATIONS)[::2]
+        tracks = state.numbers(LANDMARK)[rows, 0]
+        state = State({**state.arrays, LANDMARK: state[LANDMARK][rows]}, {**state.index, LANDMARK: tracks})
     stage, state = declared(state, observations)
     quiet = None if hooks is None else Hooks(should_stop=hooks.should_stop)
     minimum, _ = run_stage(until_converged(stage), state, quiet)

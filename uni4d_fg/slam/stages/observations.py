@@ -46,6 +46,11 @@ class Observations:
         chosen[evenly_spread(len(tracks), max(1, len(tracks) * count // max(len(self), 1)))] = True
         return np.asarray(chosen[row])
 
+    def parted(self, count: int) -> tuple[Observations, Observations, IntArray]:
+        """Return those that :meth:`thinned` chooses, the others, and the rows of the chosen tracks among all, (M,)."""
+        chosen = self.thinned(count)
+        return self.select(chosen), self.select(~chosen), np.unique(self.rows()[1][chosen])
+
     @classmethod
     def joined(cls, parts: Sequence[Observations]) -> Observations:
         """Return the observations of several parts that share no track."""
