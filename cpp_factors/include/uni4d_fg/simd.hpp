@@ -230,11 +230,19 @@ UNI4D_FG_INLINE Simd8<bytes> larger(const Simd8<bytes>& value, double bound) {
 }
 
 /// Smaller of a value and a bound, per lane; the value where it is NaN.
-template <int bytes>
-UNI4D_FG_INLINE Simd8<bytes> at_most(const Simd8<bytes>& value, double bound) {
-  Simd8<bytes> out;
-  const typename Simd8<bytes>::Part limit = bound + typename Simd8<bytes>::Part{};
+template <typename T, int width, int bytes>
+UNI4D_FG_INLINE Simd<T, width, bytes> at_most(const Simd<T, width, bytes>& value, std::common_type_t<T> bound) {
+  Simd<T, width, bytes> out;
+  const typename Simd<T, width, bytes>::Part limit = bound + typename Simd<T, width, bytes>::Part{};
   for (int i = 0; i < out.kParts; ++i) out.part[i] = limit < value.part[i] ? limit : value.part[i];
+  return out;
+}
+
+/// Absolute value per lane.
+template <typename T, int width, int bytes>
+UNI4D_FG_INLINE Simd<T, width, bytes> magnitude(const Simd<T, width, bytes>& a) {
+  Simd<T, width, bytes> out;
+  for (int i = 0; i < out.kParts; ++i) out.part[i] = a.part[i] < 0 ? -a.part[i] : a.part[i];
   return out;
 }
 

@@ -1,4 +1,5 @@
 // SIMD values: the same results in registers of every width, on any processor.
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <limits>
@@ -20,7 +21,7 @@ template <int bytes>
 void lanes_are_numbers() {
   const auto a = load<Simd8<bytes>>(kValues), b = load<Simd8<bytes>>(kOthers);
   const Simd8<bytes> computed = -(2.0 * a + b * a - a / b) - 1.0;
-  const auto high = larger(a, 0.5), low = at_most(a, 0.5), above = is_above(a, 0.5);
+  const auto high = larger(a, 0.5), low = at_most(a, 0.5), above = is_above(a, 0.5), sizes = magnitude(a);
   Simd8<bytes> moved = b;
   moved += a;
   double stored[8];
@@ -30,6 +31,7 @@ void lanes_are_numbers() {
     check(same(computed[i], -(2.0 * x + y * x - x / y) - 1.0), "arithmetic");
     check(same(high[i], larger(x, 0.5)), "larger");
     check(same(low[i], at_most(x, 0.5)), "at_most");
+    check(same(sizes[i], std::abs(x)), "magnitude");
     check(same(above[i], is_above(x, 0.5)), "is_above");
     check(same(stored[i], y + x), "+=");
   }
@@ -67,6 +69,8 @@ void floats_are_summed() {
   for (int i = 0; i < 16; ++i) values[i] = static_cast<float>(i * i) - 7.0F;
   const auto a = load<SimdFloat<bytes>>(values);
   check(sum(2.0F * a + a) == 3.0 * (1240.0 - 112.0), "sum of floats");
+  const auto bounded = at_most(magnitude(a), 5.0F);
+  for (int i = 0; i < 16; ++i) check(bounded[i] == std::min(std::abs(values[i]), 5.0F), "floats at most");
 }
 
 template <int bytes>

@@ -123,27 +123,28 @@ def test_what_is_marked_moving_is_not_matched() -> None:
     assert np.mean(relative_error(found, truth) < 0.05) > 0.8
 
 
-def test_cpp_and_numpy_agree(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(("radius", "width"), [(2, WIDTH), (1, WIDTH - 5), (7, WIDTH - 16)])
+def test_cpp_and_numpy_agree(radius: int, width: int, rng: np.random.Generator) -> None:
     core, reason = find_extension()
     if core is None:
         pytest.skip(reason)
     poses = [at(0.1, 0.02, 0.05), at(-0.12), at(0.02, -0.1)]
-    image = view(at(0.0))[0]
+    image = view(at(0.0))[0][:, :width]
     image[10:14, 10:20] = np.nan
-    others = np.stack([view(pose)[0] for pose in poses])
+    others = np.stack([view(pose)[0][:, :width] for pose in poses])
     others += 0.005 * rng.standard_normal(others.shape).astype(np.float32)
     others[1, 30:34, 5:9] = np.nan
     camera = np.array([[FOCAL, 0, K[2]], [0, FOCAL, K[3]], [0, 0, 1]])
     turn = cv2.Rodrigues(np.array([0.01, -0.02, 0.03]))[0]
     turns = np.stack([camera @ (turn if i == 0 else np.eye(3)) @ np.linalg.inv(camera) for i in range(3)])
     shifts = np.stack([camera @ -pose[:3, 3] for pose in poses])
-    planes = np.linspace(0.2, 0.8, 40)
-    slow = sweep_numpy(image, others, turns, shifts, planes, **SETTINGS)
+    planes, settings = np.linspace(0.2, 0.8, 40), SETTINGS | {"radius": radius}
+    slow = sweep_numpy(image, others, turns, shifts, planes, **settings)
     fast = core.plane_sweep(
-        image.astype(np.float64), others.astype(np.float64), turns, shifts, planes, threads=2, **SETTINGS
+        image.astype(np.float64), others.astype(np.float64), turns, shifts, planes, threads=2, **settings
     )
     one = core.plane_sweep(
-        image.astype(np.float64), others.astype(np.float64), turns, shifts, planes, threads=1, **SETTINGS
+        image.astype(np.float64), others.astype(np.float64), turns, shifts, planes, threads=1, **settings
     )
     for a, b in zip(fast, one, strict=True):
         np.testing.assert_array_equal(a, b)
