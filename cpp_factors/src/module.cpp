@@ -14,6 +14,7 @@ void bind_frame_comparison(nb::module_& module);
 void bind_guided_median(nb::module_& module);
 void bind_guided_upsampling(nb::module_& module);
 void bind_triangulation(nb::module_& module);
+void bind_moved_evidence(nb::module_& module);
 }  // namespace uni4d_fg
 
 NB_MODULE(_core, module) {
@@ -21,7 +22,7 @@ NB_MODULE(_core, module) {
   // Objects that outlive the interpreter's own clean-up (in a failed test, say) are no reason to print.
   nb::set_leak_warnings(false);
   // Raised by every new entry point and every change of a signature or of a meaning.
-  module.attr("ABI") = 9;
+  module.attr("ABI") = 10;
   uni4d_fg::bind_factor_types(module);
   uni4d_fg::bind_whitening(module);
   uni4d_fg::bind_pair_system(module);
@@ -33,4 +34,5 @@ NB_MODULE(_core, module) {
   uni4d_fg::bind_guided_median(module);
   uni4d_fg::bind_guided_upsampling(module);
   uni4d_fg::bind_triangulation(module);
+  uni4d_fg::bind_moved_evidence(module);
 }

@@ -22,14 +22,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from uni4d_fg.arrays import Float32Array, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.depth_range import DepthRange, depth_range
+from uni4d_fg.cues.evidence_numpy import moved_evidence_numpy
 from uni4d_fg.cues.guided_filter import sum_colors
 from uni4d_fg.cues.static_scene import StaticPrediction
+from uni4d_fg.optim.extension import find_extension
 
-_MEDIAN_OF_SQUARE = 0.455
-"""Of the square of a standard normal variable."""
 _SAMPLE = 4
 """Medians over an image take every fourth pixel in x and y."""
 _LIT = 0.97
@@ -43,9 +43,7 @@ class ComparedFrame:
     color: Float32Array | ImageArray
     """(h, w, 3), slightly blurred, gray levels."""
     nearest: Float32Array
-    """Least log depth around."""
-    known: BoolArray
-    """Depth is known somewhere around."""
+    """Least depth around, in the unit of the cameras; infinite where none is known."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class FrameAppearance:
     @property
     def compared(self) -> ComparedFrame:
         """What others are compared with."""
-        return ComparedFrame(self.color, self.depth.nearest, self.depth.known)
+        return ComparedFrame(self.color, _nearest(self.depth))
 
 
 def frame_appearance(
@@ -103,8 +101,7 @@ def compared_frame(
     image: ImageArray, depth: Float32Array, log_scale: float, edge_window_px: int, config: MotionMaskConfig
 ) -> ComparedFrame:
     """Prepare only what others are compared with; the arguments are those of :func:`frame_appearance`."""
-    around = _depth_around(depth, log_scale, edge_window_px)
-    return ComparedFrame(_blurred(image, config), around.nearest, around.known)
+    return ComparedFrame(_blurred(image, config), _nearest(_depth_around(depth, log_scale, edge_window_px)))
 
 
 def _blurred(image: ImageArray, config: MotionMaskConfig) -> ImageArray:
@@ -113,6 +110,10 @@ def _blurred(image: ImageArray, config: MotionMaskConfig) -> ImageArray:
 
 def _depth_around(depth: Float32Array, log_scale: float, edge_window_px: int) -> DepthRange:
     return depth_range(depth * np.float32(np.exp(log_scale)), edge_window_px)
+
+
+def _nearest(around: DepthRange) -> Float32Array:
+    return np.where(around.known, np.exp(around.nearest), np.float32(np.inf))
 
 
 def with_other_depth(
@@ -147,57 +148,16 @@ def moved_evidence(
         texture: Variance of the colors (h, w) around, where a pixel may also be one of the target's in a shadow; None
             does not look for shadows.
     """
-    height, width = source.contrast.shape
-    u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
-    inside = (u >= 1) & (u <= width - 2) & (v >= 1) & (v <= height - 2)
-    seen = cv2.remap(target.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    difference = source.color - seen.astype(np.float32, copy=False)
-    sampled = (slice(None, None, _SAMPLE),) * 2
-    some = inside[sampled]
-    if not some.any():
-        return np.zeros((height, width), np.float32)
-    difference -= np.median(difference[sampled][some], axis=0)  # exposure
-    squared = _squared(difference, config)
-
-    du, dv = source.sigma_depth * static.du, source.sigma_depth * static.dv
-    gxx, gxy, gyy = source.gradient
-    variance = source.variance + (du * du * gxx + 2 * du * dv * gxy + dv * dv * gyy)
-    # Blur and noise of this pair of frames: most of the image is static.
-    variance *= max(1.0, float(np.median((squared[sampled] / variance[sampled])[some])) / _MEDIAN_OF_SQUARE)
-    evidence = _log_odds(squared, variance, source.contrast)
-    if texture is not None:
-        rest, shaded = _without_shadow(source.color, difference, config)
-        shaded &= 2 * texture > variance
-        in_shadow = _log_odds(_squared(rest, config), variance, texture)
-        evidence = np.where(shaded, np.minimum(evidence, in_shadow), evidence)
-
-    nearest, known = (
-        cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        for values in (target.nearest, target.known.astype(np.float32))
+    u, v, du, dv, z = (
+        np.ascontiguousarray(part, np.float32) for part in (static.u, static.v, static.du, static.dv, static.z)
     )
-    hidden = (known > 0) & (nearest < static.log_z - config.occlusion_margin)
-    return np.where(inside & ~hidden, np.clip(evidence, *config.evidence_limits), 0).astype(np.float32)
-
-
-def _squared(difference: Float32Array, config: MotionMaskConfig) -> Float32Array:
-    """Return the mean square (h, w) around of a difference of colors (h, w, 3), summed over them."""
-    mean = cv2.boxFilter(sum_colors(difference * difference), -1, (config.patch_px, config.patch_px))
-    return np.asarray(mean, np.float32)
-
-
-def _log_odds(
-    squared: Float32Array, variance: Float32Array | FloatArray, contrast: Float32Array
-) -> Float32Array | FloatArray:
-    wider = variance + 2 * contrast
-    return np.asarray(0.5 * (squared / variance - squared / wider - np.log(wider / variance)))
-
-
-def _without_shadow(
-    color: Float32Array, difference: Float32Array, config: MotionMaskConfig
-) -> tuple[Float32Array, BoolArray]:
-    """Return what a shadow leaves of a difference of colors (h, w, 3), and where one would be (h, w)."""
-    lit, window = color - difference, (config.shadow_window_px, config.shadow_window_px)
-    common, power = (cv2.boxFilter(sum_colors(lit * other), -1, window) for other in (color, lit))
-    gain = common / np.maximum(power, np.float32(1.0))
-    rest = color - np.clip(gain, np.float32(config.deepest_shadow), np.float32(1.0))[..., None] * lit
-    return rest, np.asarray(gain < _LIT)
+    seen = cv2.remap(target.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    core, _ = find_extension()
+    compare = moved_evidence_numpy if core is None else core.moved_evidence
+    evidence: Float32Array = compare(
+        source.color, seen.astype(np.float32, copy=False), u, v, du, dv, z, source.sigma_depth, *source.gradient,
+        source.variance, source.contrast, texture, target.nearest, patch=config.patch_px,
+        shadow_window=config.shadow_window_px, deepest_shadow=config.deepest_shadow, lit=_LIT,
+        nearer=float(np.exp(-config.occlusion_margin)), limits=config.evidence_limits, step=_SAMPLE,
+    )  # fmt: skip
+    return evidence
