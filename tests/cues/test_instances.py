@@ -168,6 +168,19 @@ def test_things_that_were_apart_stay_so_where_they_touch(first_touch: int, stay_
         assert (result[-1][inside] == number).mean() > 0.95
 
 
+def test_what_leaves_a_region_was_another_thing() -> None:
+    """Two touch from the beginning and part: beyond a gap of their own size they have numbers of their own."""
+    gap = [max(0, 6 * (t - 3)) for t in range(14)]
+    scene = Scene({1: [(30, 52 - g // 2) for g in gap], 2: [(30, 80 + g // 2) for g in gap]})
+    found = [components((labels > 0).astype(np.int32)) for labels in scene.truth]
+    result = associate(scene, found, join_parts=True)
+    first, second = (numbers_of(result, scene.truth, n) for n in (1, 2))
+    assert [a == b for a, b in zip(first, second, strict=True)] == [g <= 28 for g in gap]
+    assert len(np.unique(result[result > 0])) == 2
+    together = associate(scene, found, join_parts=True, max_part_gap=10.0)
+    assert len(np.unique(together[together > 0])) == 1
+
+
 def test_a_thing_that_left_while_another_region_covers_its_place_parts_nothing() -> None:
     """Two were apart; one leaves the picture: the other's region stays whole, and no empty one is made of it."""
     leaves: list[tuple[int, int] | None] = [(30, 120 + 6 * t) for t in range(6)]

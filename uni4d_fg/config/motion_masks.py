@@ -24,6 +24,11 @@ class InstanceConfig(Section):
         False, "A further detection within an instance is a part of it: for regions, which break where hidden."
     )
     min_part_overlap: float = setting(0.5, "Least share of a part that lies within its instance.", gt=0, le=1)
+    max_part_gap: float = setting(
+        1.0,
+        "What is farther away than this, in parts of the side of a square of its area, is no part but left it.",
+        ge=0,
+    )
     min_apart_frames: int = setting(
         5, "Where parts are joined, things that were apart for this many frames stay so where they touch.", ge=1
     )

@@ -2,7 +2,8 @@
 
 An instance of the last frame is warped to the new one by optical flow and compared with the new detections; the
 assignment of least total cost (Hungarian method) on intersection over union continues it. A region found by motion may
-hold several things that were apart before: it is parted among them. An instance that is not
+hold several things that were apart before: it is parted among them; and what leaves a region for good was another
+thing. An instance that is not
 found is moved on by its last velocity for a few frames, so that it keeps its number when it comes back from behind
 something: the flow there is that of what hides it.
 """
@@ -203,7 +204,12 @@ def _assign(
     taken = {row for row, _ in pairs}
     if config.join_parts:
         for column in np.flatnonzero(number_of == 0).tolist():
-            rows_around = [row for row in taken if within[row, column] >= config.min_part_overlap]
+            rows_around = [
+                row
+                for row in taken
+                if within[row, column] >= config.min_part_overlap
+                and _gap(instances[row].mask, small[column]) <= config.max_part_gap
+            ]
             if rows_around:
                 best = max(rows_around, key=lambda row: float(within[row, column]))
                 number_of[column] = instances[best].number
@@ -215,6 +221,12 @@ def _assign(
         instances.append(_Instance(next_number, int(found.class_ids[column]), small[column], np.zeros(2)))
         next_number += 1
     return number_of, next_number
+
+
+def _gap(mask: Float32Array, part: Float32Array) -> float:
+    """Return how far a part (h, w) is from a mask (h, w), in parts of the side of a square of the part's area."""
+    nearest = float(_distance(mask > 0.5)[part > 0.5].min(initial=np.inf))
+    return nearest / max(float(np.sqrt(part.sum())), 1.0)
 
 
 def _overlaps(instances: list[_Instance], small: list[Float32Array]) -> tuple[FloatArray, FloatArray]:

@@ -47,8 +47,11 @@ _MAX_FRAMES = 240
 """Longer videos are taken in parts, as work grows with the third power."""
 _MIN_DISTANCE_PX = 6.0
 """Tracks nearer to each other say nothing of the size."""
-_PAIRS = 400
+_PAIRS = 1600
 _MIN_PAIRS = 20
+_DRAWS = 3
+"""Of so many tracks the one that is nearest to another is paired with it: where a mask holds two things, pairs are
+within either of them."""
 _SIZE_WINDOW = 5
 """Frames over which the logarithm of the size is averaged."""
 _OUTLIER = 3.0
@@ -103,9 +106,13 @@ def _apparent_size(uv: FloatArray, visible: BoolArray) -> FloatArray:
     steps = np.zeros(uv.shape[1] - 1)
     for frame in range(len(steps)):
         both = np.flatnonzero(visible[:, frame] & visible[:, frame + 1])
-        a, b = rng.choice(both, _PAIRS), rng.choice(both, _PAIRS)
-        before, after = (np.linalg.norm(uv[a, t] - uv[b, t], axis=1) for t in (frame, frame + 1))
-        good = (before > _MIN_DISTANCE_PX) & (after > 0)
+        a, others = rng.choice(both, _PAIRS), rng.choice(both, (_DRAWS, _PAIRS))
+        distance = np.linalg.norm(uv[a, frame] - uv[others, frame], axis=2)
+        distance[distance <= _MIN_DISTANCE_PX] = np.inf
+        nearest = distance.argmin(axis=0)
+        b, before = others[nearest, np.arange(_PAIRS)], distance.min(axis=0)
+        after = np.linalg.norm(uv[a, frame + 1] - uv[b, frame + 1], axis=1)
+        good = np.isfinite(before) & (after > 0)
         if np.count_nonzero(good) >= _MIN_PAIRS:
             steps[frame] = np.median(np.log(after[good] / before[good]))
     log_size = np.concatenate(([0.0], np.cumsum(steps)))
