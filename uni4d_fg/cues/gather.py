@@ -254,6 +254,8 @@ class _Gathering:
         self.motion_has_parallax = found.has_parallax
         self.cameras_of_motion = found.world_T_cam
         self.moving_tracks = found.moving
+        if found.stray.any():
+            self.tracks = tracks = tracks.without(found.stray)
         self.intrinsics_of_motion, self.focal_sigma = found.intrinsics, found.focal_sigma
         if found.has_parallax:
             self.camera, self.is_read_at_once = found.camera, found.is_read_at_once

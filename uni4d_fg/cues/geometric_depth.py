@@ -70,6 +70,8 @@ class GeometricDepth:
     """(K, T) depth of every static observation that is triangulated well, NaN elsewhere."""
     moving: BoolArray
     """(K,) tracks that contradict a static scene."""
+    stray: BoolArray
+    """(K, T) observations of another static surface than most of their track."""
     has_parallax: bool
     """False if the camera stays in one place, so that depth is a convention."""
     focal_sigma: float
@@ -175,6 +177,9 @@ def _with_maps(
 ) -> GeometricDepth:
     """Scale the structure and make depth maps of it."""
     settings = config.geometric_depth
+    stray = np.zeros(tracks.visible.shape, dtype=bool)
+    stray[observations.track[structure.stray], observations.frame[structure.stray]] = True
+    observations = observations.select(~structure.stray)
     ideal = structure.camera.ideal_observations(observations)
     structure = _normalize(structure, ideal, settings.median_depth)
     inverse = _inverse_depths(structure, ideal, settings)
@@ -206,8 +211,8 @@ def _with_maps(
     moving = np.zeros(tracks.num_tracks, dtype=bool)
     moving[structure.track] = structure.moving
     return GeometricDepth(
-        depths, structure.world_T_cam, structure.camera, sparse, moving, True, structure.focal_sigma, facts, warnings,
-        structure.readout is None, start,
+        depths, structure.world_T_cam, structure.camera, sparse, moving, stray, True, structure.focal_sigma, facts,
+        warnings, structure.readout is None, start,
     )  # fmt: skip
 
 
@@ -404,7 +409,8 @@ def _without_parallax(
         )
     moving = np.zeros(tracks.num_tracks, dtype=bool)
     sigma = 0.0 if found is None else found.sigma
-    return GeometricDepth(depths, poses, camera, sparse, moving, False, sigma, facts, warnings)
+    stray = np.zeros(tracks.visible.shape, dtype=bool)
+    return GeometricDepth(depths, poses, camera, sparse, moving, stray, False, sigma, facts, warnings)
 
 
 def _on_sphere(uv: FloatArray, intrinsics: FloatArray, radius: float) -> FloatArray:

@@ -84,7 +84,7 @@ def geometric_depth(
         # Written last: with it, the maps are complete.
         cache.put_arrays(
             _RECORD, sparse=result.sparse, intrinsics=result.intrinsics, world_T_cam=result.world_T_cam,
-            moving=result.moving, has_parallax=np.array([result.has_parallax]),
+            moving=result.moving, stray=np.packbits(result.stray, axis=1), has_parallax=np.array([result.has_parallax]),
             is_read_at_once=np.array([result.is_read_at_once]),
             focal_sigma=np.array([result.focal_sigma]), camera=result.camera.to_array(), said=np.array(said), **arrays,
         )  # fmt: skip
@@ -97,8 +97,9 @@ def geometric_depth(
     else:
         depths = FloatMaps(tuple(cache.map_path(name) for name in names), video.image_size)
     camera = CameraModel.of_array(stored["camera"], stored["intrinsics"])
+    stray = np.unpackbits(stored["stray"], axis=1, count=tracks.num_frames).astype(bool)
     return GeometricDepth(
-        depths, stored["world_T_cam"], camera, stored["sparse"].astype(np.float32), stored["moving"],
+        depths, stored["world_T_cam"], camera, stored["sparse"].astype(np.float32), stored["moving"], stray,
         bool(stored["has_parallax"][0]), float(stored["focal_sigma"][0]), tuple(facts), tuple(warnings),
         bool(stored["is_read_at_once"][0]), summary,
     )  # fmt: skip
@@ -114,7 +115,7 @@ def _grids(depths: FrameSource[Float32Array], reporter: Reporter, should_stop: S
 
 
 def _stored_structure(cache: FrameCache, tracks: Tracks, with_grids: bool) -> dict[str, npt.NDArray[Any]] | None:
-    ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "moving": 1, "said": None}
+    ranks = {"sparse": 2, "intrinsics": 1, "world_T_cam": 3, "moving": 1, "stray": 2, "said": None}
     ranks |= {"has_parallax": 1, "is_read_at_once": 1, "focal_sigma": 1, "camera": 1}
     ranks |= {"grids": 3} if with_grids else {}
     stored = cache.arrays(_RECORD, ranks)

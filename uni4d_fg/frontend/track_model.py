@@ -76,6 +76,11 @@ class Tracks:
         confidence = None if self.confidence is None else self.confidence[keep]
         return Tracks(self.uv[keep], self.visible[keep], self.query_frame[keep], confidence, self.blur_px)
 
+    def without(self, dropped: BoolArray) -> Tracks:
+        """Return the same tracks with some observations, (K, T), not visible."""
+        uv = np.where(dropped[..., None], np.float32(np.nan), self.uv)
+        return replace(self, uv=uv, visible=self.visible & ~dropped)
+
     def in_frames(self, frames: IntArray, query_frame: Int32Array) -> Tracks:
         """Return what is seen in some frames (t,), of tracks that were started in frames (K,), counted among these."""
         confidence = None if self.confidence is None else self.confidence[:, frames]

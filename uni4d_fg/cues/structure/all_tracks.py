@@ -6,6 +6,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.cues.structure.growing import GrowingScene
+from uni4d_fg.cues.structure.one_surface import strays
 from uni4d_fg.cues.structure.triangulation import (
     Points,
     RayBundle,
@@ -15,6 +16,20 @@ from uni4d_fg.cues.structure.triangulation import (
     triangulate,
 )
 from uni4d_fg.slam.stages.observations import Observations
+
+
+def strays_of_all_tracks(observations: Observations, poses: FloatArray, scene: GrowingScene) -> BoolArray:
+    """Return which observations (N,) are of another surface than most of their track, see :mod:`.one_surface`.
+
+    The arguments are those of :func:`points_of_all_tracks`.
+    """
+    posed = scene.registered[observations.frame]
+    seen = observations.select(posed)
+    tracks, row = seen.rows()
+    rays = RayBundle(row, poses, seen.frame, seen.uv, scene.intrinsics, len(tracks))
+    out = np.zeros(len(observations), np.bool_)
+    out[posed] = strays(rays, _limit(scene), scene.config.geometric_depth.triangulation_huber_px)
+    return out
 
 
 def points_of_all_tracks(
@@ -32,7 +47,7 @@ def points_of_all_tracks(
     """
     observations = observations.select(scene.registered[observations.frame])
     tracks, row = observations.rows()
-    limit, huber_px = float(np.median(scene.limit_px)), scene.config.geometric_depth.triangulation_huber_px
+    limit, huber_px = _limit(scene), scene.config.geometric_depth.triangulation_huber_px
     rays = RayBundle(row, poses, observations.frame, observations.uv, scene.intrinsics, len(tracks))
     points = triangulate(rays, huber_px)
     with np.errstate(invalid="ignore"):
@@ -48,6 +63,10 @@ def points_of_all_tracks(
     moving |= parting & (_median_error_far_away(far) > limit)
     points.position[wrong | moving] = np.nan
     return tracks, points, moving
+
+
+def _limit(scene: GrowingScene) -> float:
+    return float(np.median(scene.limit_px))
 
 
 def _median_error_far_away(rays: RayBundle) -> FloatArray:

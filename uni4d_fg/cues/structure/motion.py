@@ -13,7 +13,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import with_smaller_angles, without_rolling_shutter
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
-from uni4d_fg.cues.structure.all_tracks import points_of_all_tracks
+from uni4d_fg.cues.structure.all_tracks import points_of_all_tracks, strays_of_all_tracks
 from uni4d_fg.cues.structure.camera_fit import zoom_freedom
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength, needs_zoom
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
@@ -82,6 +82,8 @@ class Structure:
     """M points, NaN where a track cannot be triangulated."""
     moving: BoolArray
     """(M,) tracks that contradict a static point: half of their errors are beyond the limit for tracks."""
+    stray: BoolArray
+    """(N,) observations, of those given, that are of another static surface than most of their track."""
     sigma_px: float
     """Noise of the tracks (robust standard deviation of a reprojection residual)."""
     pair: FramePair
@@ -227,11 +229,12 @@ def structure_from_motion(
             scene.hold_focal(likely)
             sigma = scene.measure_noise()
             poses = _bridge(scene.world_T_cam, scene.registered)
-    track, points, moving = points_of_all_tracks(observations, poses, scene)
+    stray = strays_of_all_tracks(observations, poses, scene)
+    track, points, moving = points_of_all_tracks(observations.select(~stray), poses, scene)
     reporter.end()
     return Structure(
-        poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, sigma, best.pair,
-        focal, focal_sigma, best.unexplained, rivals, readout,
+        poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, stray, sigma,
+        best.pair, focal, focal_sigma, best.unexplained, rivals, readout,
     )  # fmt: skip
 
 
