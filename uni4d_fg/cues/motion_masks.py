@@ -107,7 +107,10 @@ def motion_masks(
     camera = camera or CameraModel(intrinsics)
     ideal = camera.ideal_tracks(tracks)
     if known_moving is None:
-        known_moving = _contradicting(ideal, video.image_size, intrinsics, settings, report, stop)
+        known_moving, stray = _contradicting(ideal, video.image_size, intrinsics, settings, report, stop)
+        if stray.any():
+            tracks = tracks.without(stray)
+            ideal = camera.ideal_tracks(tracks)
     report.begin("motion of tracks", config.camera_rounds if world_T_cam is None else 1)
     cameras, motion = _tracks_and_cameras(
         video, depths, tracks, ideal, camera, known_moving, world_T_cam, config, settings, report, stop
@@ -207,15 +210,20 @@ def _tracks_and_cameras(
 def _contradicting(
     tracks: Tracks, image_size: tuple[int, int], intrinsics: FloatArray, settings: Config, report: Reporter,
     stop: Callable[[], bool],
-) -> BoolArray:  # fmt: skip
-    """Return which tracks (K,) contradict a static scene, whatever their depth; none without parallax to see it by."""
-    out = np.zeros(tracks.num_tracks, dtype=bool)
-    seen = observations_of_tracks(tracks, ~out)
+) -> tuple[BoolArray, BoolArray]:  # fmt: skip
+    """Find what contradicts a static scene, whatever its depth; nothing does without parallax to see it by.
+
+    Returns:
+        The tracks (K,) that do, and the observations (K, T) of another static surface than most of their track.
+    """
+    moving, stray = np.zeros(tracks.num_tracks, dtype=bool), np.zeros(tracks.visible.shape, dtype=bool)
+    seen = observations_of_tracks(tracks, ~moving)
     if len(np.unique(seen.track)) < settings.geometric_depth.min_pose_points:
-        return out
+        return moving, stray
     found = structure_from_motion(
         seen, tracks.num_frames, image_size, intrinsics, settings, report, stop, with_doubts=False
     )
     if found is not None:
-        out[found.track] = found.moving
-    return out
+        moving[found.track] = found.moving
+        stray[seen.track[found.stray], seen.frame[found.stray]] = True
+    return moving, stray
