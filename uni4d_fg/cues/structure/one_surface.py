@@ -8,12 +8,14 @@ explained by points that stand still.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
 from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
 
-_WINDOWS = ((0.0, 0.5), (0.5, 1.0), (0.0, 0.3), (0.35, 0.65), (0.7, 1.0))
+_WINDOWS = ((0.0, 0.4), (0.3, 0.7), (0.6, 1.0))
 """Parts of a track from which its point is looked for."""
 _WHOLE = 0.9
 """A track whose point explains this part of it is of one surface."""
@@ -37,7 +39,8 @@ def strays(rays: RayBundle, limit_px: float, huber_px: float) -> BoolArray:
     chosen = mixed[rays.row]
     if not chosen.any():
         return out
-    rays = rays.select(chosen)
+    number = np.cumsum(mixed) - 1
+    rays, total = replace(rays.select(chosen), row=number[rays.row[chosen]], count=int(mixed.sum())), total[mixed]
     part = _place(rays)
     best = np.zeros(len(rays.row), np.bool_)
     for first, last in _WINDOWS:
