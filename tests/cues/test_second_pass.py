@@ -34,10 +34,13 @@ def passes(
     at_once: bool = True,
     given: np.ndarray | None = None,
     warnings: list[str] | None = None,
+    strays: np.ndarray | None = None,
+    tracked: list[Tracks] | None = None,
 ) -> tuple[list[tuple[CameraModel | None, StartCameras | None]], list[Any], np.ndarray]:
     """Gather cues of frames alone, or with given intrinsics, with a structure from motion that finds a camera.
 
-    Warnings of the report are added to ``warnings``.
+    Warnings of the report are added to ``warnings``, and to ``tracked`` the tracks that each pass and the masks are
+    given; of these every pass finds ``strays`` (3, T).
 
     Returns:
         Cameras that are known and to start from in each pass; poses that masks are made with; those that were found.
@@ -51,14 +54,19 @@ def passes(
     masked: list[Any] = []
 
     def depth(
-        _video: Any, _tracks: Any, _static: Any, _intrinsics: Any, known: Any, start: Any, *_: Any
+        _video: Any, given_tracks: Tracks, _static: Any, _intrinsics: Any, known: Any, start: Any, *_: Any
     ) -> GeometricDepth:
         calls.append((known, start))
         sparse, moving = np.ones(visible.shape, np.float32), np.zeros(3, bool)
-        return GeometricDepth(depths, poses, camera, sparse, moving, has_parallax, 0.01, (), (), at_once)
+        if tracked is not None:
+            tracked.append(given_tracks)
+        stray = np.zeros(visible.shape, bool) if strays is None else strays
+        return GeometricDepth(depths, poses, camera, sparse, moving, stray, has_parallax, 0.01, (), (), at_once)
 
     def masks(*arguments: Any) -> tuple[ArrayFrames, list[str], list[str]]:
         masked.append(arguments[7])
+        if tracked is not None:
+            tracked.append(arguments[2])
         return ArrayFrames(np.zeros((FRAMES, *SIZE), np.int32)), [], []
 
     monkeypatch.setattr(gather, "geometric_depth", depth)
@@ -122,3 +130,16 @@ def test_cameras_without_parallax_are_no_start(tmp_path: Path, monkeypatch: pyte
     calls, masked, _ = passes(CameraModel(INTRINSICS), tmp_path, monkeypatch, has_parallax=False)
     assert all(call == (None, None) for call in calls)
     assert masked == [None]
+
+
+def test_what_is_of_another_surface_is_dropped_for_all_that_comes_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strays, tracked = np.zeros((3, FRAMES), bool), list[Tracks]()
+    strays[1, 2:] = True
+    passes(CameraModel(INTRINSICS), tmp_path, monkeypatch, strays=strays, tracked=tracked)
+    first, of_masks, second = tracked
+    assert first.visible.all()
+    for tracks in (of_masks, second):
+        np.testing.assert_array_equal(tracks.visible, ~strays)
+        np.testing.assert_array_equal(np.isnan(tracks.uv[..., 0]), strays)
