@@ -1,11 +1,11 @@
-"""The plane sweep of ``cpp_factors/src/plane_sweep.cpp`` in NumPy: what it must give, and what runs without it.
+"""The plane sweep of ``cpp_factors/src/plane_sweep.cpp`` and ``plane_matching.cpp`` in NumPy: what it must give.
 
-For every plane, each other image is warped onto the reference and compared by normalized cross-correlation over a
-window, and by differences of gray values over a smaller one, which keep edges; of more than two images the two that
-match best count, so that a pixel which some do not see is still found. Costs are whole numbers up to 255, weighted
-means of (1 - correlation) 127.5 and of the difference over its largest one; 128 where nothing is known. Semi-global
-matching sums them along eight paths (Hirschmueller 2008), with a penalty for a change of plane that is lower across
-edges of the image.
+It runs where the extension is not installed. For every plane, each other image is warped onto the reference and
+compared by normalized cross-correlation over a window, and by differences of gray values over a smaller one, which keep
+edges; of more than two images the two that match best count, so that a pixel which some do not see is still found.
+Costs are whole numbers up to 255, weighted means of (1 - correlation) 127.5 and of the difference over its largest one;
+128 where nothing is known. Semi-global matching sums them along eight paths (Hirschmueller 2008), with a penalty for a
+change of plane that is lower across edges of the image.
 """
 
 from __future__ import annotations
