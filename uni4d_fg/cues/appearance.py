@@ -18,6 +18,7 @@ another thing. Where there is none, nothing does (plain clothes before a plain w
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -65,9 +66,9 @@ class FrameAppearance:
     variance: Float32Array
     """Of a difference of colors, but for what an error of depth does."""
 
-    @property
+    @cached_property
     def compared(self) -> ComparedFrame:
-        """What others are compared with."""
+        """What others are compared with; many pairs of frames ask for it."""
         return ComparedFrame(self.color, _nearest(self.depth))
 
 
