@@ -18,6 +18,8 @@ if (($# > 1)); then
     python -m pip install --quiet --no-deps --upgrade --target "$build" "$source" \
         -Ccmake.define.UNI4D_FG_CPP_SANITIZE="$kind"
     library="$(g++ -print-file-name="lib$([[ $kind == thread ]] && echo t || echo a)san.so")"
+    # The sanitizer looks for what throws exceptions before the module that uses it is loaded.
+    library+=":$(g++ -print-file-name=libstdc++.so.6)"
     # What Python keeps until its end counts as leaked. The threads of NumPy's BLAS, which is not instrumented, stay out.
     export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
     PYTHONPATH="$build:${PYTHONPATH:-}" ASAN_OPTIONS=detect_leaks=0 \
