@@ -87,18 +87,24 @@ UNI4D_FG_WIDE_CLONES void log_odds(const float* __restrict squared, const float*
 }
 
 /// Take what all pixels share off the differences of colors, and add up their squares.
-UNI4D_FG_WIDE_CLONES void squares_of_rest(const float* __restrict color, const float* __restrict seen, float red,
-                                          float green, float blue, std::size_t count, float* __restrict out) {
+UNI4D_FG_WIDE_CLONES void squares_of_rest(const float* __restrict color, const float* __restrict seen,
+                                          const float* __restrict shared, std::size_t count, float* __restrict out) {
   for (std::size_t i = 0; i < count; ++i) {
-    const float r = color[3 * i] - seen[3 * i] - red, g = color[3 * i + 1] - seen[3 * i + 1] - green;
-    const float b = color[3 * i + 2] - seen[3 * i + 2] - blue;
+    const float r = color[3 * i] - seen[3 * i] - shared[0], g = color[3 * i + 1] - seen[3 * i + 1] - shared[1];
+    const float b = color[3 * i + 2] - seen[3 * i + 2] - shared[2];
     out[i] = r * r + g * g + b * b;
   }
 }
 
 /// Add what an error of depth does to a difference of colors.
 UNI4D_FG_WIDE_CLONES void with_depth(const ComparedPixels& p, std::size_t count, float* __restrict out) {
-  const float* __restrict du = p.du, * __restrict dv = p.dv, * __restrict sigma = p.sigma, * __restrict gxx = p.gxx, * __restrict gxy = p.gxy, * __restrict gyy = p.gyy, * __restrict variance = p.variance;
+  const float* __restrict du = p.du;
+  const float* __restrict dv = p.dv;
+  const float* __restrict sigma = p.sigma;
+  const float* __restrict gxx = p.gxx;
+  const float* __restrict gxy = p.gxy;
+  const float* __restrict gyy = p.gyy;
+  const float* __restrict variance = p.variance;
   for (std::size_t i = 0; i < count; ++i) {
     const float x = sigma[i] * du[i], y = sigma[i] * dv[i];
     out[i] = variance[i] + (x * x * gxx[i] + 2.0F * x * y * gxy[i] + y * y * gyy[i]);
@@ -145,7 +151,8 @@ UNI4D_FG_WIDE_CLONES void forgive_shadows(const float* __restrict gain, const fl
 /// The pixel of the other frame that is nearest to where each one is seen; -1 for none.
 UNI4D_FG_WIDE_CLONES void find_places(const ComparedPixels& p, std::size_t count, int* __restrict out) {
   const float right = static_cast<float>(p.width - 2), low = static_cast<float>(p.height - 2);
-  const float* __restrict u = p.u, * __restrict v = p.v;
+  const float* __restrict u = p.u;
+  const float* __restrict v = p.v;
   for (std::size_t i = 0; i < count; ++i) {
     const bool inside = (u[i] >= 1.0F) & (u[i] <= right) & (v[i] >= 1.0F) & (v[i] <= low);
     const float x = inside ? u[i] : 1.0F, y = inside ? v[i] : 1.0F;
@@ -159,12 +166,14 @@ class Comparison {
   Comparison(const ComparedPixels& pixels, const EvidenceOptions& options)
       : p_(pixels),
         options_(options),
-        count_(static_cast<std::size_t>(pixels.height) * static_cast<std::size_t>(pixels.width)) {
+        count_(static_cast<std::size_t>(pixels.height) * static_cast<std::size_t>(pixels.width)),
+        places_(count_) {
+    find_places(p_, count_, places_.data());
     for (int y = 0; y < p_.height; y += options.step)
       for (int x = 0; x < p_.width; x += options.step) {
         const std::size_t at =
             static_cast<std::size_t>(y) * static_cast<std::size_t>(p_.width) + static_cast<std::size_t>(x);
-        if (is_inside(at)) sample_.push_back(at);
+        if (places_[at] >= 0) sample_.push_back(at);
       }
   }
 
@@ -175,7 +184,7 @@ class Comparison {
     for (std::size_t c = 0; c < 3; ++c)
       shared[c] = median_of([&](std::size_t at) { return p_.color[3 * at + c] - p_.seen[3 * at + c]; });
     Floats squares(count_), squared(count_), variance(count_), evidence(count_);
-    squares_of_rest(p_.color, p_.seen, shared[0], shared[1], shared[2], count_, squares.data());
+    squares_of_rest(p_.color, p_.seen, shared, count_, squares.data());
     mean_over(squares, options_.patch, squared);
     with_depth(p_, count_, variance.data());
     // Blur and noise of this pair of frames: most of the image is static.
@@ -194,18 +203,12 @@ class Comparison {
       forgive_shadows(gain.data(), p_.texture, variance.data(), in_shadow.data(), options_.lit, count_,
                       evidence.data());
     }
-    std::vector<int> places(count_);
-    find_places(p_, count_, places.data());
     for (std::size_t i = 0; i < count_; ++i)
-      if (places[i] >= 0 && !(p_.nearest[places[i]] < options_.nearer * p_.z[i]))
+      if (places_[i] >= 0 && !(p_.nearest[places_[i]] < options_.nearer * p_.z[i]))
         out[i] = std::min(std::max(evidence[i], options_.least), options_.most);
   }
 
  private:
-  bool is_inside(std::size_t at) const {
-    const float u = p_.u[at], v = p_.v[at];
-    return u >= 1.0F && u <= static_cast<float>(p_.width - 2) && v >= 1.0F && v <= static_cast<float>(p_.height - 2);
-  }
   template <typename F>
   float median_of(F value) const {
     Floats values(sample_.size());
@@ -219,6 +222,7 @@ class Comparison {
   const ComparedPixels& p_;
   const EvidenceOptions& options_;
   std::size_t count_;
+  std::vector<int> places_;  // of `find_places`
   std::vector<std::size_t> sample_;
 };
 

@@ -91,7 +91,7 @@ def test_the_static_prediction_is_the_projection_and_its_slope_the_derivative(rn
     there = world_to_camera(poses[[1] * 50], point)
     expected = project(INTRINSICS, there)
     np.testing.assert_allclose(np.stack((static.u, static.v), axis=1), expected, atol=1e-3)
-    np.testing.assert_allclose(static.log_z, np.log(there[:, 2]), atol=1e-5)
+    np.testing.assert_allclose(np.log(static.z), np.log(there[:, 2]), atol=1e-5)
     near, far = (
         predict_static(uv[:, 0], uv[:, 1], np.log(depth) + h, relative_pose(poses, 0, 1), INTRINSICS)
         for h in (-1e-3, 1e-3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uni4d_fg.cues.structure.one_surface import strays
-from uni4d_fg.cues.structure.triangulation import RayBundle
+from uni4d_fg.cues.structure.triangulation import RayBundle, triangulate
 from uni4d_fg.geometry.camera import project, world_to_camera
 
 K = np.array([500.0, 500.0, 320.0, 180.0])
@@ -29,6 +29,10 @@ def rays_of(paths: list[np.ndarray], poses: np.ndarray, rng: np.random.Generator
     return RayBundle(row, poses, frame, np.concatenate(uv), K, len(paths))
 
 
+def found_strays(rays: RayBundle) -> np.ndarray:
+    return strays(rays, triangulate(rays, HUBER_PX).errors_of(rays), LIMIT_PX, HUBER_PX)
+
+
 def standing(x: float, z: float) -> np.ndarray:
     return np.tile([x, 0.1, z], (FRAMES, 1))
 
@@ -45,8 +49,9 @@ def going_over(where: float, at: int, poses: np.ndarray) -> np.ndarray:
 def test_the_longer_part_is_kept(backwards: bool, rng: np.random.Generator) -> None:
     poses = cameras(rng)
     paths = [going_over(x, 26, poses) for x in np.linspace(-1.0, 1.0, 8)]
-    found = strays(rays_of([path[::-1] if backwards else path for path in paths], poses[::-1] if backwards else poses,
-                           rng), LIMIT_PX, HUBER_PX)  # fmt: skip
+    if backwards:
+        paths, poses = [path[::-1] for path in paths], poses[::-1]
+    found = found_strays(rays_of(paths, poses, rng))
     of_pole = np.arange(FRAMES) >= 26
     share = found.reshape(8, FRAMES).mean(axis=0)
     truth = of_pole[::-1] if backwards else of_pole
@@ -58,7 +63,7 @@ def test_the_longer_part_is_kept(backwards: bool, rng: np.random.Generator) -> N
 def test_what_is_of_one_surface_is_left_whole(rng: np.random.Generator) -> None:
     poses = cameras(rng)
     whole = [standing(x, z) for x, z in zip(np.linspace(-1, 1, 10), np.linspace(1.5, 9, 10), strict=True)]
-    assert not strays(rays_of(whole, poses, rng), LIMIT_PX, HUBER_PX).any()
+    assert not found_strays(rays_of(whole, poses, rng)).any()
 
 
 def test_what_begins_to_move_is_left_whole(rng: np.random.Generator) -> None:
@@ -71,12 +76,12 @@ def test_what_begins_to_move_is_left_whole(rng: np.random.Generator) -> None:
         path[:, 0] += 0.03 * since
         path[:, 1] += 0.1 * np.sin(0.6 * since)
         paths.append(path)
-    assert not strays(rays_of(paths, poses, rng), LIMIT_PX, HUBER_PX).any()
+    assert not found_strays(rays_of(paths, poses, rng)).any()
 
 
 def test_short_tracks_and_none_are_left_alone(rng: np.random.Generator) -> None:
     poses = cameras(rng)
     rays = rays_of([going_over(0.3, 26, poses)], poses, rng)
     short = rays.select((rays.frame > 20) & (rays.frame < 31))
-    assert not strays(short, LIMIT_PX, HUBER_PX).any()
-    assert len(strays(rays.select(rays.frame < 0), LIMIT_PX, HUBER_PX)) == 0
+    assert not found_strays(short).any()
+    assert len(found_strays(rays.select(rays.frame < 0))) == 0

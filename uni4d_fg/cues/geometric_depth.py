@@ -177,8 +177,7 @@ def _with_maps(
 ) -> GeometricDepth:
     """Scale the structure and make depth maps of it."""
     settings = config.geometric_depth
-    stray = np.zeros(tracks.visible.shape, dtype=bool)
-    stray[observations.track[structure.stray], observations.frame[structure.stray]] = True
+    stray = observations.table(structure.stray, tracks.visible.shape)
     observations = observations.select(~structure.stray)
     ideal = structure.camera.ideal_observations(observations)
     structure = _normalize(structure, ideal, settings.median_depth)

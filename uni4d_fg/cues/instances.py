@@ -3,9 +3,8 @@
 An instance of the last frame is warped to the new one by optical flow and compared with the new detections; the
 assignment of least total cost (Hungarian method) on intersection over union continues it. A region found by motion may
 hold several things that were apart before: it is parted among them; and what leaves a region for good was another
-thing. An instance that is not
-found is moved on by its last velocity for a few frames, so that it keeps its number when it comes back from behind
-something: the flow there is that of what hides it.
+thing. An instance that is not found is moved on by its last velocity for a few frames, so that it keeps its number when
+it comes back from behind something: the flow there is that of what hides it.
 """
 
 from __future__ import annotations

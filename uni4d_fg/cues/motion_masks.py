@@ -225,5 +225,5 @@ def _contradicting(
     )
     if found is not None:
         moving[found.track] = found.moving
-        stray[seen.track[found.stray], seen.frame[found.stray]] = True
+        stray = seen.table(found.stray, tracks.visible.shape)
     return moving, stray

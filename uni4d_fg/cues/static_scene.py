@@ -35,11 +35,6 @@ class StaticPrediction:
     dv: AnyFloat
     """Change of the predicted pixel per unit of log depth, px: the direction of the epipolar line."""
 
-    @property
-    def log_z(self) -> AnyFloat:
-        """Predicted log depth."""
-        return np.asarray(np.log(self.z))
-
 
 def predict_static(
     u: AnyFloat, v: AnyFloat, log_depth: AnyFloat, target_T_source: FloatArray, intrinsics: FloatArray

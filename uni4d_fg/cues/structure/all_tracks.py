@@ -18,23 +18,9 @@ from uni4d_fg.cues.structure.triangulation import (
 from uni4d_fg.slam.stages.observations import Observations
 
 
-def strays_of_all_tracks(observations: Observations, poses: FloatArray, scene: GrowingScene) -> BoolArray:
-    """Return which observations (N,) are of another surface than most of their track, see :mod:`.one_surface`.
-
-    The arguments are those of :func:`points_of_all_tracks`.
-    """
-    posed = scene.registered[observations.frame]
-    seen = observations.select(posed)
-    tracks, row = seen.rows()
-    rays = RayBundle(row, poses, seen.frame, seen.uv, scene.intrinsics, len(tracks))
-    out = np.zeros(len(observations), np.bool_)
-    out[posed] = strays(rays, _limit(scene), scene.config.geometric_depth.triangulation_huber_px)
-    return out
-
-
 def points_of_all_tracks(
     observations: Observations, poses: FloatArray, scene: GrowingScene
-) -> tuple[IntArray, Points, BoolArray]:
+) -> tuple[IntArray, Points, BoolArray, BoolArray]:
     """Triangulate every track from the frames with a pose, twice: the second time without what did not fit.
 
     Args:
@@ -43,15 +29,25 @@ def points_of_all_tracks(
         scene: What tells which frames have a pose, and up to which error, px, a track agrees with its point.
 
     Returns:
-        The tracks (M,); their points, NaN where there is none; and which (M,) contradict a static point.
+        The tracks (M,); their points, NaN where there is none; which (M,) contradict a static point; and which
+        observations (N,) are of another surface than most of their track and take no part, see :mod:`.one_surface`.
     """
-    observations = observations.select(scene.registered[observations.frame])
+    posed = scene.registered[observations.frame]
+    observations = observations.select(posed)
     tracks, row = observations.rows()
-    limit, huber_px = _limit(scene), scene.config.geometric_depth.triangulation_huber_px
+    limit, huber_px = float(np.median(scene.limit_px)), scene.config.geometric_depth.triangulation_huber_px
     rays = RayBundle(row, poses, observations.frame, observations.uv, scene.intrinsics, len(tracks))
     points = triangulate(rays, huber_px)
+    error = points.errors_of(rays)
+    stray = np.zeros(len(posed), np.bool_)
+    stray[posed] = other = strays(rays, error, limit, huber_px)
+    if other.any():
+        parted = np.bincount(row, other, len(tracks)) > 0
+        points = points.replaced(parted, triangulate(rays.select(~other & parted[row]), huber_px))
+        rays = rays.select(~other)
+        row, error = rays.row, points.errors_of(rays)
     with np.errstate(invalid="ignore"):
-        fits = points.errors_of(rays) <= scene.limit_px[observations.frame]
+        fits = error <= scene.limit_px[rays.frame]
         moving = points.error_px > limit
     again = np.bincount(row, ~fits, len(tracks)) > 0
     points = points.replaced(again, triangulate(rays.select(fits & again[row]), huber_px))
@@ -62,11 +58,7 @@ def points_of_all_tracks(
     far = rays.select(parting[row])
     moving |= parting & (_median_error_far_away(far) > limit)
     points.position[wrong | moving] = np.nan
-    return tracks, points, moving
-
-
-def _limit(scene: GrowingScene) -> float:
-    return float(np.median(scene.limit_px))
+    return tracks, points, moving, stray
 
 
 def _median_error_far_away(rays: RayBundle) -> FloatArray:

@@ -13,7 +13,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import with_smaller_angles, without_rolling_shutter
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
-from uni4d_fg.cues.structure.all_tracks import points_of_all_tracks, strays_of_all_tracks
+from uni4d_fg.cues.structure.all_tracks import points_of_all_tracks
 from uni4d_fg.cues.structure.camera_fit import zoom_freedom
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength, needs_zoom
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
@@ -229,8 +229,7 @@ def structure_from_motion(
             scene.hold_focal(likely)
             sigma = scene.measure_noise()
             poses = _bridge(scene.world_T_cam, scene.registered)
-    stray = strays_of_all_tracks(observations, poses, scene)
-    track, points, moving = points_of_all_tracks(observations.select(~stray), poses, scene)
+    track, points, moving, stray = points_of_all_tracks(observations, poses, scene)
     reporter.end()
     return Structure(
         poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, stray, sigma,

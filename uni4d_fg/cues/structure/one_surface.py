@@ -25,17 +25,19 @@ _EXPLAINED = 0.75
 """Both points explain this part of what is theirs."""
 
 
-def strays(rays: RayBundle, limit_px: float, huber_px: float) -> BoolArray:
+def strays(rays: RayBundle, error_px: FloatArray, limit_px: float, huber_px: float) -> BoolArray:
     """Return which rays (N,) are of another static surface than most of their track is.
 
     Args:
         rays: Those of a track in the order of time.
+        error_px: (N,) of the points of whole tracks.
         limit_px: Up to this error a point explains a ray.
         huber_px: Of the triangulation.
     """
-    fits, total = _fits(rays, np.ones(len(rays.row), np.bool_), limit_px, huber_px), _count(rays, None)
+    total = np.bincount(rays.row, minlength=rays.count)
     out = np.zeros(len(rays.row), np.bool_)
-    mixed = (_count(rays, fits) < _WHOLE * total) & (total >= 2 * _LEAST)
+    with np.errstate(invalid="ignore"):
+        mixed = (_count(rays, error_px <= limit_px) < _WHOLE * total) & (total >= 2 * _LEAST)
     chosen = mixed[rays.row]
     if not chosen.any():
         return out
@@ -64,9 +66,9 @@ def _fits(rays: RayBundle, which: BoolArray, limit_px: float, huber_px: float) -
         return np.asarray(points.errors_of(rays) <= limit_px)
 
 
-def _count(rays: RayBundle, which: BoolArray | None) -> IntArray:
-    """Return the number of rays, or of some of them, of each track (M,)."""
-    return np.bincount(rays.row if which is None else rays.row[which], minlength=rays.count)
+def _count(rays: RayBundle, which: BoolArray) -> IntArray:
+    """Return how many of some rays (N,) each track (M,) has."""
+    return np.bincount(rays.row[which], minlength=rays.count)
 
 
 def _explains(rays: RayBundle, theirs: BoolArray, fits: BoolArray) -> BoolArray:

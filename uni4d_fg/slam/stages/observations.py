@@ -51,6 +51,12 @@ class Observations:
         chosen = self.thinned(count)
         return self.select(chosen), self.select(~chosen), np.unique(self.rows()[1][chosen])
 
+    def table(self, which: BoolArray, shape: tuple[int, ...]) -> BoolArray:
+        """Return some of the observations (N,) as a table of tracks and frames, (K, T) ``shape``."""
+        out = np.zeros(shape, dtype=bool)
+        out[self.track[which], self.frame[which]] = True
+        return out
+
     @classmethod
     def joined(cls, parts: Sequence[Observations]) -> Observations:
         """Return the observations of several parts that share no track."""
