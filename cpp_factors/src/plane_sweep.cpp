@@ -12,6 +12,8 @@ namespace uni4d_fg {
 
 namespace {
 
+constexpr float kLeastSmallStep = 6.0F;  // across an edge a change by one plane is not free
+
 /// One step of a path: out = cost + min(previous, neighbors + small, least + large) - least; returns the least of out.
 UNI4D_FG_CLONES std::uint16_t path_step(const std::uint8_t* __restrict cost, const std::uint16_t* __restrict previous,
                                         std::uint16_t least, int depth, std::uint16_t small, std::uint16_t large,
@@ -65,7 +67,8 @@ class Aggregation {
         std::uint16_t* sum = &total[at(y, x)];
         std::uint16_t *to = &side[k % 2][1], *from = &side[1 - k % 2][1];
         if (k == 0) start(from, side_least);
-        side_least = path_step(cost, from, side_least, depth_, small(), large(y, x, 0, sign), to, sum);
+        const Penalty along = penalty(y, x, 0, sign);
+        side_least = path_step(cost, from, side_least, depth_, along.small, along.large, to, sum);
         for (int path = 0; path < 3; ++path) {
           const int dx = path - 1;  // the pixel above is at x - dx
           const auto base = static_cast<std::size_t>(path) * cells + 1;
@@ -76,16 +79,17 @@ class Aggregation {
           std::uint16_t low = least[before][place + other];
           const bool inside = i > 0 && x - dx >= 0 && x - dx < width_;
           if (!inside) start(row_from, low);
-          least[now][place + column] =
-              path_step(cost, row_from, low, depth_, small(), inside ? large(y, x, sign, dx) : zero(), row_to, sum);
+          const Penalty across = penalty(y, x, sign, dx);
+          least[now][place + column] = path_step(cost, row_from, low, depth_, across.small, across.large, row_to, sum);
         }
       }
     }
   }
 
  private:
-  static std::uint16_t zero() { return 0; }
-  std::uint16_t small() const { return static_cast<std::uint16_t>(options_.small_step); }
+  struct Penalty {
+    std::uint16_t small, large;
+  };
   std::size_t at(int y, int x) const {
     return (static_cast<std::size_t>(y) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(x)) *
            static_cast<std::size_t>(depth_);
@@ -94,17 +98,20 @@ class Aggregation {
     std::fill(from, from + depth_, static_cast<std::uint16_t>(0));
     least = 0;
   }
-  /// Penalty of a large change between a pixel and that `dy` rows and `dx` columns before it.
-  std::uint16_t large(int y, int x, int dy, int dx) const {
+  /// Penalties of a change between a pixel and that `dy` rows and `dx` columns before it: lower across edges.
+  Penalty penalty(int y, int x, int dy, int dx) const {
     const int v = y - dy, u = x - dx;
-    if (u < 0 || v < 0 || u >= width_ || v >= height_) return 0;
+    if (u < 0 || v < 0 || u >= width_ || v >= height_) return {0, 0};
     const float a =
         image_[static_cast<std::size_t>(y) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(x)];
     const float b =
         image_[static_cast<std::size_t>(v) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(u)];
     const float difference = a == a && b == b ? std::abs(a - b) : 0.0F;
-    const float penalty = static_cast<float>(options_.large_step) / (1.0F + difference / options_.edge_contrast);
-    return static_cast<std::uint16_t>(std::max(penalty, static_cast<float>(options_.small_step)));
+    const float flatness = 1.0F / (1.0F + difference / options_.edge_contrast);
+    const float flat = static_cast<float>(options_.small_step);
+    const float small = std::max(flat * flatness, std::min(flat, kLeastSmallStep));
+    return {static_cast<std::uint16_t>(small),
+            static_cast<std::uint16_t>(std::max(static_cast<float>(options_.large_step) * flatness, small))};
   }
 
   const std::vector<std::uint8_t>& cost_;

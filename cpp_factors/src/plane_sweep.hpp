@@ -21,8 +21,8 @@ struct SweepOptions {
   float noise = 0.01F;              // standard deviation of the images' noise, in their unit
   float difference_share = 0.4F;    // part of the cost that differences of gray values are, beside correlation
   float largest_difference = 0.1F;  // larger differences are all alike
-  int small_step = 6;               // penalty of a change by one plane
-  int large_step = 60;              // penalty of a larger change, where the image is flat
+  int small_step = 30;              // penalty of a change by one plane, where the image is flat
+  int large_step = 100;             // penalty of a larger one, alike
   float edge_contrast = 0.05F;      // image difference that halves the penalty of a large change
   int threads = 1;
 };

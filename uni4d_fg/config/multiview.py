@@ -37,9 +37,11 @@ class MultiviewConfig(Section):
         le=1,
     )
     largest_difference: float = setting(0.1, "Larger differences of gray values, of 1, are all alike.", gt=0, le=1)
-    small_step_penalty: int = setting(6, "Cost (of 255) of a neighbor that is one plane away.", ge=0, le=255)
-    large_step_penalty: int = setting(100, "Cost of one that is farther away, where the image is flat.", ge=0, le=1000)
-    edge_contrast: float = setting(0.03, "A difference between gray values, of 1, that halves that cost.", gt=0)
+    small_step_penalty: int = setting(
+        30, "Cost (of 255) of a neighbor that is one plane away, where the image is flat.", ge=0, le=255
+    )
+    large_step_penalty: int = setting(100, "Cost of one that is farther away, alike.", ge=0, le=1000)
+    edge_contrast: float = setting(0.03, "A difference between gray values, of 1, that halves these costs.", gt=0)
     mask_band_px: int = setting(3, "Width of the band around moving things that is not matched, working px.", ge=0)
     compared_offsets: tuple[int, ...] = setting(
         (2, 5), "Depth of a frame is compared with that of the frames this far before and after."

@@ -25,6 +25,7 @@ from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, i
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize, without_band, working_frame
+from uni4d_fg.results.fusion.planar_smoothing import smoothed_where_unsure
 from uni4d_fg.results.fusion.static_depth import (
     HeldOut,
     StaticDepth,
@@ -220,7 +221,10 @@ class DenseMaps:
         mine = self._static(frame)
         averaged = self._averaged(frame)
         averaged = averaged._replace(log_depth=self.size.continued(averaged.log_depth))
+        sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
         filled, moving, unmasked = averaged.log_depth, mask, mine.unmasked
+        if self.prefers_matching and self.is_interpolated:
+            filled = smoothed_where_unsure(filled, np.where(unmasked, sure, np.float32(0)), mine.color)
         if self.prefers_matching and (mask > 0).any():
             behind = self._behind(frame)
             fitted = self._fitted(frame, mask, behind)
@@ -228,7 +232,6 @@ class DenseMaps:
             filled = np.where(shown, -np.log(np.where(shown, behind.inverse, np.float32(1))), filled)
             unmasked = unmasked & ~self.size.straight(fitted.missed)
             moving = fitted.applied(mask, self.size.plain)
-        sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
         sure[~unmasked & (mine.depth.matched <= STILL)] = 0
         log_depth, sure = self.size.shown(filled), self.size.shown(self.size.continued(sure))
         if frame in self.broken or self.bleeding_px:

@@ -19,7 +19,7 @@ SETTINGS = {
     "noise": 0.01,
     "difference_share": 0.4,
     "largest_difference": 0.1,
-    "small_step": 6,
+    "small_step": 30,
     "large_step": 100,
     "edge_contrast": 0.03,
 }

@@ -4,8 +4,8 @@ It runs where the extension is not installed. For every plane, each other image 
 compared by normalized cross-correlation over a window, and by differences of gray values over a smaller one, which keep
 edges; of more than two images the two that match best count, so that a pixel which some do not see is still found.
 Costs are whole numbers up to 255, weighted means of (1 - correlation) 127.5 and of the difference over its largest one;
-128 where nothing is known. Semi-global matching sums them along eight paths (Hirschmueller 2008), with a penalty for a
-change of plane that is lower across edges of the image.
+128 where nothing is known. Semi-global matching sums them along eight paths (Hirschmueller 2008), with penalties for a
+change of plane that are lower across edges of the image.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 _UNKNOWN = 128
 _NARROW = 1
 """Half side of the window over which gray values are compared themselves, px."""
+_LEAST_SMALL_STEP = np.float32(6)
+"""Across an edge of the image a change by one plane is not free."""
 
 
 def sweep_numpy(
@@ -47,9 +49,9 @@ def sweep_numpy(
         noise: Standard deviation of the images' noise.
         difference_share: Part of the cost that differences of gray values are.
         largest_difference: Larger ones are all alike.
-        small_step: Penalty of a change by one plane.
-        large_step: Penalty of a larger change where the image is flat.
-        edge_contrast: Difference between pixels that halves it.
+        small_step: Penalty of a change by one plane where the image is flat.
+        large_step: Penalty of a larger one, alike.
+        edge_contrast: Difference between pixels that halves them.
 
     Returns:
         The best plane as a number between them, its aggregated cost, that of the best plane elsewhere, and the
@@ -136,27 +138,30 @@ def _path_costs(
     dy, dx = step
     before = np.roll(image, (dy, dx), axis=(0, 1))
     difference = np.nan_to_num(np.abs(image - before))
-    jump = np.maximum(np.float32(large) / (1 + difference / np.float32(contrast)), small).astype(np.int32)
+    flatness = np.float32(1) / (1 + difference / np.float32(contrast))
+    least = np.maximum(np.float32(small) * flatness, min(np.float32(small), _LEAST_SMALL_STEP))
+    jump = np.maximum(np.float32(large) * flatness, least).astype(np.int32)
+    slide = least.astype(np.int32)
     out = costs.copy()
     if dy == 0:
         for x in range(width)[:: 1 if dx > 0 else -1]:
             if 0 <= x - dx < width:
-                out[:, x] += _least_step(out[:, x - dx], jump[:, x], small)
+                out[:, x] += _least_step(out[:, x - dx], slide[:, x], jump[:, x])
         return out
     for y in range(height)[:: 1 if dy > 0 else -1]:
         if 0 <= y - dy < height:
             here = slice(max(dx, 0), width + min(dx, 0))
             there = slice(max(-dx, 0), width + min(-dx, 0))
-            out[y, here] += _least_step(out[y - dy, there], jump[y, here], small)
+            out[y, here] += _least_step(out[y - dy, there], slide[y, here], jump[y, here])
     return out
 
 
-def _least_step(previous: Int32Array, jump: Int32Array, small: int) -> npt.NDArray[np.int32]:
-    """Return the least cost of coming from the previous pixels (N, D), less their least."""
+def _least_step(previous: Int32Array, small: Int32Array, large: Int32Array) -> npt.NDArray[np.int32]:
+    """Return the least cost of coming from the previous pixels (N, D), less their least, at penalties (N,)."""
     least = previous.min(axis=1, keepdims=True)
-    best = np.minimum(previous, least + jump[:, None])
-    best[:, 1:] = np.minimum(best[:, 1:], previous[:, :-1] + small)
-    best[:, :-1] = np.minimum(best[:, :-1], previous[:, 1:] + small)
+    best = np.minimum(previous, least + large[:, None])
+    best[:, 1:] = np.minimum(best[:, 1:], previous[:, :-1] + small[:, None])
+    best[:, :-1] = np.minimum(best[:, :-1], previous[:, 1:] + small[:, None])
     return np.asarray(best - least, np.int32)
 
 
