@@ -49,3 +49,6 @@ class MultiviewConfig(Section):
     max_disagreement: float = setting(
         0.03, "Depth of two frames agrees if it differs by less than this part.", gt=0, lt=1
     )
+    edge_offsets: tuple[int, ...] = setting(
+        (4, 8, 12), "Edges of depth are looked for again in the frames this far before and after; none: they stay."
+    )

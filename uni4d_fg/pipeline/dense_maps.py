@@ -204,7 +204,7 @@ class DenseMaps:
         wanted = sorted(number for number in near if 0 <= number < self.sequence.num_frames and number not in self.made)
         if not self.unmatched and wanted:
             # Frames that are matched share what they are matched with, and matching has threads of its own.
-            self.multiview.forget_before(wanted[0])
+            self.multiview.forget_before(wanted[0], frames[0])
             self.measured |= {number: self.multiview.at(number) for number in wanted}
         # A broken frame takes its cue from others.
         for numbers in ([n for n in wanted if n not in self.broken], [n for n in wanted if n in self.broken]):
@@ -236,6 +236,8 @@ class DenseMaps:
         log_depth, sure = self.size.shown(filled), self.size.shown(self.size.continued(sure))
         if frame in self.broken or self.bleeding_px:
             log_depth = guided_median(log_depth, sure, self.size.shown(mine.static), self.sequence.images[frame])
+            if self.prefers_matching and self.is_interpolated and self.size is self.size.plain:
+                log_depth = self.multiview.edges_again(frame, log_depth, sure)
             full = np.exp(upsample_guided(log_depth, self.sequence.images[frame]))
             full[np.isnan(given)] = np.nan
         else:

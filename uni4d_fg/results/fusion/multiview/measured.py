@@ -12,12 +12,16 @@ from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.results.fusion.averaging import average_over_frames
 from uni4d_fg.results.fusion.multiview.confidence import Evidence, confidence, relative_sigma
+from uni4d_fg.results.fusion.multiview.edges import edges_again
 from uni4d_fg.results.fusion.multiview.exposure import Shown, exposures
 from uni4d_fg.results.fusion.multiview.planes import choose_planes
 from uni4d_fg.results.fusion.multiview.sweep import sweep
 from uni4d_fg.results.fusion.multiview.views import choose_views
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize
 from uni4d_fg.results.fusion.pixel_transfer import pixel_transfer
+
+_UNSURE = 0.5
+"""Edges of depth that is surer stay where they are."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +90,43 @@ class MultiviewDepth:
         sure = self.size.within(np.ones_like(own.inverse_depth), 0)
         return Measured(-np.log(own.inverse_depth), sure, relative_sigma(own.evidence))
 
-    def forget_before(self, frame: int) -> None:
-        """Forget what frames from this one on do not need."""
+    def edges_again(self, frame: int, log_depth: Float32Array, sure: Float32Array) -> Float32Array:
+        """Return log depth (h, w) of a frame with the edges of the static scene where other frames see them.
+
+        Args:
+            frame: The frame.
+            log_depth: (h, w), NaN where missing.
+            sure: (h, w) probability that it is right.
+        """
+        near = [frame + sign * offset for offset in self.config.edge_offsets for sign in (-1, 1)]
+        views = [number for number in near if 0 <= number < len(self.world_T_cam)]
+        if not views:
+            return log_depth
+        own, pose, cameras = self._shown(frame), self.world_T_cam[frame], self.cameras
+        there = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
+        transfers = [pixel_transfer(cameras[frame], cameras[view], at) for view, at in zip(views, there, strict=True)]
+        # What moves is nobody's match for long: where masks are too large, other frames are seen all the same.
+        others = [
+            self._shown(view).gray * np.float32(factor)
+            for view, factor in zip(views, self._brightness(frame, views, self.seen(frame)), strict=True)
+        ]
+        known = np.isfinite(log_depth)
+        inverse = np.exp(-np.where(known, log_depth, np.float32(0)))
+        chosen = known & (sure < _UNSURE)
+        again = edges_again(inverse, own.matched, chosen, others, transfers, self.threads)
+        return np.where(again == inverse, log_depth, -np.log(again))
+
+    def forget_before(self, frame: int, finished: int) -> None:
+        """Forget what is not needed any more.
+
+        Args:
+            frame: The first one that is still to be matched.
+            finished: All frames before this one are finished.
+        """
         oldest = frame - max(self.config.compared_offsets, default=0)
         self.raw = {number: kept for number, kept in self.raw.items() if number >= oldest}
-        self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest - self.config.reach}
+        oldest = min(oldest - self.config.reach, finished - max(self.config.edge_offsets, default=0))
+        self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest}
 
     def _raw(self, frame: int) -> _Raw | None:
         if frame not in self.raw:
@@ -114,11 +150,18 @@ class MultiviewDepth:
         transfers = [pixel_transfer(cameras[frame], cameras[view], at) for view, at in zip(views, there, strict=True)]
         planes = choose_planes(z, transfers, sides, self.config)
         own = self._shown(frame)
-        others = [Shown(self._shown(view).matched, self.world_T_cam[view], cameras[view]) for view in views]
-        factors = exposures(Shown(own.matched, pose, cameras[frame]), others, points)
-        matched = [other.gray * np.float32(factor) for other, factor in zip(others, factors, strict=True)]
+        factors = self._brightness(frame, views, points)
+        matched = [self._shown(view).matched * np.float32(factor) for view, factor in zip(views, factors, strict=True)]
         swept = sweep(own.gray, matched, transfers, planes, self.config, self.threads)
         step = np.float32(planes[1] - planes[0])
         return _Raw(
             self.size.continued(swept.inverse_depth), Evidence.of(swept, step / swept.inverse_depth, len(views))
         )
+
+    def _brightness(self, frame: int, views: list[int], points: FloatArray) -> list[float]:
+        """Return by how much gray values of other frames are to be multiplied to be as bright as a frame's."""
+        own, *others = (
+            Shown(self._shown(number).matched, self.world_T_cam[number], self.cameras[number])
+            for number in (frame, *views)
+        )
+        return exposures(own, others, points)
