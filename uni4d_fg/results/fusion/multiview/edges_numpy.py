@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from uni4d_fg.results.fusion.multiview.warp_numpy import warp
 
 _AROUND = np.ones((9, 9), np.uint8)
 _EDGE = np.float32(0.1)
 """Range of log depth within that window from which on a pixel is near an edge."""
-REACHES = (2, 4, 7)
+_REACHES = (2, 4, 7)
 """Depths are tried of the pixels so far to the left and right, above and below, px."""
 _ALIKE = np.float32(0.02)
 """Log depths that differ by less are one."""
@@ -75,7 +76,7 @@ def edges_again_numpy(
     window = _window(image, row, column)
     cost = _cost(out, window, others, turns, shifts) - _BETTER
     cost[np.isinf(cost)] = -np.inf
-    for reach in REACHES:
+    for reach in _REACHES:
         for dy, dx in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
             v, u = row + dy, column + dx
             inside = (v >= 0) & (u >= 0) & (v < image.shape[0]) & (u < image.shape[1])
@@ -114,21 +115,10 @@ def _cost(
     u, v, gray, weight = window
     rho, found = inverse_depth[:, None], []
     for other, turn, shift in zip(others, turns.astype(np.float32), shifts.astype(np.float32), strict=True):
-        height, width = other.shape
-        a, b, c = (turn[i, 0] * u + (turn[i, 1] * v + turn[i, 2] + rho * shift[i]) for i in range(3))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = a / c, b / c
-            inside = (c > 0) & (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        x, y = np.where(inside, x, 0), np.where(inside, y, 0)
-        i, j = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
-        p, q = x - i.astype(np.float32), y - j.astype(np.float32)
-        top = other[j, i] * (1 - p) + other[j, i + 1] * p
-        low = other[j + 1, i] * (1 - p) + other[j + 1, i + 1] * p
-        value = top * (1 - q) + low * q
-        known = inside & np.isfinite(value)
+        value, known = warp(other, turn, shift, u, v, rho)
         share = np.where(known, weight, np.float32(0))
         total = share.sum(axis=1)
-        unlike = share * np.minimum(np.abs(np.where(known, value, np.float32(0)) - gray), _LARGEST)
+        unlike = share * np.minimum(np.abs(value - gray), _LARGEST)
         with np.errstate(divide="ignore", invalid="ignore"):
             found.append(np.where(total >= _SHOWN, unlike.sum(axis=1) / total, np.float32(np.inf)))
     ordered = np.sort(np.stack(found), axis=0)

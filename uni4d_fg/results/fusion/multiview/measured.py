@@ -18,7 +18,7 @@ from uni4d_fg.results.fusion.multiview.planes import choose_planes
 from uni4d_fg.results.fusion.multiview.sweep import sweep
 from uni4d_fg.results.fusion.multiview.views import choose_views
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize
-from uni4d_fg.results.fusion.pixel_transfer import pixel_transfer
+from uni4d_fg.results.fusion.pixel_transfer import PixelTransfer, pixel_transfer
 
 _UNSURE = 0.5
 """Edges of depth that is surer stay where they are."""
@@ -102,9 +102,6 @@ class MultiviewDepth:
         views = [number for number in near if 0 <= number < len(self.world_T_cam)]
         if not views:
             return log_depth
-        own, pose, cameras = self._shown(frame), self.world_T_cam[frame], self.cameras
-        there = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
-        transfers = [pixel_transfer(cameras[frame], cameras[view], at) for view, at in zip(views, there, strict=True)]
         # What moves is nobody's match for long: where masks are too large, other frames are seen all the same.
         others = [
             self._shown(view).gray * np.float32(factor)
@@ -113,7 +110,8 @@ class MultiviewDepth:
         known = np.isfinite(log_depth)
         inverse = np.exp(-np.where(known, log_depth, np.float32(0)))
         chosen = known & (sure < _UNSURE)
-        again = edges_again(inverse, own.matched, chosen, others, transfers, self.threads)
+        own, transfers = self._shown(frame).matched, self._transfers(frame, views)
+        again = edges_again(inverse, own, chosen, others, transfers, self.threads)
         return np.where(again == inverse, log_depth, -np.log(again))
 
     def forget_before(self, frame: int, finished: int) -> None:
@@ -146,8 +144,7 @@ class MultiviewDepth:
         views = choose_views(frame, self.world_T_cam, points, cameras, sides, self.config)
         if not views:
             return None
-        there = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
-        transfers = [pixel_transfer(cameras[frame], cameras[view], at) for view, at in zip(views, there, strict=True)]
+        transfers = self._transfers(frame, views)
         planes = choose_planes(z, transfers, sides, self.config)
         own = self._shown(frame)
         factors = self._brightness(frame, views, points)
@@ -157,6 +154,13 @@ class MultiviewDepth:
         return _Raw(
             self.size.continued(swept.inverse_depth), Evidence.of(swept, step / swept.inverse_depth, len(views))
         )
+
+    def _transfers(self, frame: int, views: list[int]) -> list[PixelTransfer]:
+        """Return where other frames see the pixels of one."""
+        pose = self.world_T_cam[frame]
+        there = [np.asarray(np.linalg.solve(self.world_T_cam[view], pose)) for view in views]
+        own = self.cameras[frame]
+        return [pixel_transfer(own, self.cameras[view], at) for view, at in zip(views, there, strict=True)]
 
     def _brightness(self, frame: int, views: list[int], points: FloatArray) -> list[float]:
         """Return by how much gray values of other frames are to be multiplied to be as bright as a frame's."""

@@ -13,7 +13,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from uni4d_fg.arrays import Float32Array, FloatArray, Int32Array
+from uni4d_fg.results.fusion.multiview.warp_numpy import warp
 
 _UNKNOWN = 128
 _NARROW = 1
@@ -81,11 +82,12 @@ def _matching_costs(
     mean = _window_mean(reference, radius)
     variance = np.maximum(_window_mean(reference * reference, radius) - mean * mean, 0)
     noise2 = np.float32(noise) ** 2
+    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     costs = np.empty((height, width, len(planes)), np.int32)
     for index, rho in enumerate(planes):
         found = []
         for other, turn, shift in zip(others, turns.astype(np.float32), shifts.astype(np.float32), strict=True):
-            warped, seen = _warp(other, turn, shift, np.float32(rho))
+            warped, seen = warp(other, turn, shift, u, v, np.float32(rho))
             there = _window_mean(warped, radius)
             spread = np.maximum(_window_mean(warped * warped, radius) - there * there, 0)
             both = _window_mean(warped * reference, radius) - there * mean
@@ -108,26 +110,6 @@ def _window_mean(values: Float32Array, radius: int) -> Float32Array:
     rows = np.stack([padded[:, k : k + width] for k in range(side)]).sum(axis=0)
     total = np.stack([rows[k : k + height] for k in range(side)]).sum(axis=0)
     return np.asarray(total * np.float32(1 / side**2), np.float32)
-
-
-def _warp(
-    other: Float32Array, turn: Float32Array, shift: Float32Array, rho: np.float32
-) -> tuple[Float32Array, BoolArray]:
-    """Return another image as the reference sees it on a plane, and where that is known."""
-    height, width = other.shape
-    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
-    a, b, c = (turn[i, 0] * x + (turn[i, 1] * y + turn[i, 2] + rho * shift[i]) for i in range(3))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = a / c, b / c
-        inside = (c > 0) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
-    i, j = np.minimum(u.astype(np.int64), width - 2), np.minimum(v.astype(np.int64), height - 2)
-    p, q = u - i.astype(np.float32), v - j.astype(np.float32)
-    top = other[j, i] * (1 - p) + other[j, i + 1] * p
-    low = other[j + 1, i] * (1 - p) + other[j + 1, i + 1] * p
-    value = top * (1 - q) + low * q
-    known = inside & np.isfinite(value)
-    return np.where(known, value, np.float32(0)), known
 
 
 def _path_costs(
