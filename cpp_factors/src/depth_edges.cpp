@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 
+#include "pixel_place.hpp"
 #include "uni4d_fg/math.hpp"
 #include "uni4d_fg/parallel.hpp"
 
@@ -38,22 +39,17 @@ constexpr float kNothing = std::numeric_limits<float>::infinity();
 UNI4D_FG_CLONES float unlikeness(const Window& window, const SweepView& view, int height, int width, float rho) {
   const float* t = view.turn;
   const float x0 = rho * view.shift[0], y0 = rho * view.shift[1], z0 = rho * view.shift[2];
-  const float right = static_cast<float>(width - 1), bottom = static_cast<float>(height - 1);
   float p[kPadded], q[kPadded], around[4][kPadded];
   int at[kPadded], inside[kPadded];
   for (int k = 0; k < kPadded; ++k) {
     const float u = window.u[k], v = window.v[k];
     const float a = t[0] * u + (t[1] * v + t[2] + x0), b = t[3] * u + (t[4] * v + t[5] + y0);
-    const float c = t[6] * u + (t[7] * v + t[8] + z0), x = a / c, y = b / c;
-    const bool shown = (c > 0.0F) & (x >= 0.0F) & (y >= 0.0F) & (x <= right) & (y <= bottom);
-    const float xs = shown ? x : 0.0F, ys = shown ? y : 0.0F;
-    int i = static_cast<int>(xs), j = static_cast<int>(ys);
-    i = i < width - 2 ? i : width - 2;
-    j = j < height - 2 ? j : height - 2;
-    at[k] = j * width + i;
-    p[k] = xs - static_cast<float>(i);
-    q[k] = ys - static_cast<float>(j);
-    inside[k] = shown ? 1 : 0;
+    const float c = t[6] * u + (t[7] * v + t[8] + z0);
+    const PixelPlace place = pixel_place(a / c, b / c, c > 0.0F, height, width);
+    at[k] = place.at;
+    p[k] = place.p;
+    q[k] = place.q;
+    inside[k] = place.shown;
   }
   for (int k = 0; k < kPadded; ++k) {
     const float *top = view.image + at[k], *low = top + width;

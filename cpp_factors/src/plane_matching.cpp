@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "pixel_place.hpp"
 #include "uni4d_fg/simd.hpp"
 
 namespace uni4d_fg {
@@ -29,19 +30,14 @@ struct RowTransfer {
 /// Where pixels of a row lie in an image: the upper left of the four around them, and how far they are from there.
 UNI4D_FG_WIDE_CLONES void locate(const RowTransfer& row, int height, int width, int begin, int count,
                                  int* __restrict at, float* __restrict p, float* __restrict q, int* __restrict seen) {
-  const float right = static_cast<float>(width - 1), bottom = static_cast<float>(height - 1);
   for (int k = 0; k < count; ++k) {
-    const float x = static_cast<float>(begin + k), z = row.e * x + row.f;
-    const float inverse = 1.0F / z, u = (row.a * x + row.b) * inverse, v = (row.c * x + row.d) * inverse;
-    const bool inside = (z > 0.0F) & (u >= 0.0F) & (v >= 0.0F) & (u <= right) & (v <= bottom);
-    const float uc = inside ? u : 0.0F, vc = inside ? v : 0.0F;
-    int i = static_cast<int>(uc), j = static_cast<int>(vc);
-    i = i < width - 2 ? i : width - 2;
-    j = j < height - 2 ? j : height - 2;
-    at[k] = j * width + i;
-    p[k] = uc - static_cast<float>(i);
-    q[k] = vc - static_cast<float>(j);
-    seen[k] = inside ? 1 : 0;
+    const float x = static_cast<float>(begin + k), z = row.e * x + row.f, inverse = 1.0F / z;
+    const PixelPlace place =
+        pixel_place((row.a * x + row.b) * inverse, (row.c * x + row.d) * inverse, z > 0.0F, height, width);
+    at[k] = place.at;
+    p[k] = place.p;
+    q[k] = place.q;
+    seen[k] = place.shown;
   }
 }
 
