@@ -72,6 +72,7 @@ class _Made(NamedTuple):
     log_cue: Float32Array
     """Before anything was done to it."""
     unmasked: BoolArray
+    """Outside of masks, or shown to stand still by several frames."""
     static: BoolArray
     """The same without a band around masks."""
     color: Float32Array
@@ -90,7 +91,7 @@ class _Judged(NamedTuple):
     share: FloatArray | None
     """(N,) part of its weight that each has; None for all of it."""
     unmasked: BoolArray
-    """(h, w)"""
+    """(h, w) outside of masks."""
     static: BoolArray
     """(h, w) the same without a band around masks."""
     errors: HeldOut
@@ -232,12 +233,12 @@ class DenseMaps:
             filled = np.where(shown, -np.log(np.where(shown, behind.inverse, np.float32(1))), filled)
             unmasked = unmasked & ~self.size.straight(fitted.missed)
             moving = fitted.applied(mask, self.size.plain)
-        sure[~unmasked & (mine.depth.matched <= STILL)] = 0
+        sure[~unmasked] = 0
         log_depth, sure = self.size.shown(filled), self.size.shown(self.size.continued(sure))
         if frame in self.broken or self.bleeding_px:
             log_depth = guided_median(log_depth, sure, self.size.shown(mine.static), self.sequence.images[frame])
             if self.prefers_matching and self.is_interpolated and self.size is self.size.plain:
-                log_depth = self.multiview.edges_again(frame, log_depth, sure)
+                log_depth = self.multiview.edges_again(frame, log_depth, sure, mine.static)
             full = np.exp(upsample_guided(log_depth, self.sequence.images[frame]))
             full[np.isnan(given)] = np.nan
         else:
@@ -366,10 +367,11 @@ class DenseMaps:
         if measured is not None and self.bleeding_px == 0:
             measured = without_edges(measured, judged.cue)
         fused = self._fused(frame, judged, measured)
+        still = fused.matched > STILL
         fused = replace(fused, log_depth=self.size.within(fused.log_depth, np.nan))
         with np.errstate(invalid="ignore"):
             inverse, log_cue = np.exp(-fused.log_depth), np.log(judged.cue)
-        return _Made(fused, inverse, log_cue, judged.unmasked, judged.static, self._color(frame))
+        return _Made(fused, inverse, log_cue, judged.unmasked | still, judged.static | still, self._color(frame))
 
     def _color(self, frame: int) -> Float32Array:
         """Return the image (h, w, 3), of 1; nothing where no frame is matched."""
@@ -398,15 +400,17 @@ class DenseMaps:
         return _Judged(cue, uv, log_z, share, unmasked, static, errors)
 
     def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
-        known = known_depth(measured, judged.uv, judged.log_z, judged.static, judged.cue.shape, judged.share)
-        like_moving = np.zeros_like(judged.static)
-        if self.bleeding_px > 0 and not judged.static.all():
-            static = self.size.shown(judged.static)
-            like_moving = looks_moving(self.sequence.images[frame], self.sequence.masks[frame], static)
-            like_moving = self.size.straight(like_moving)
+        static = judged.static if measured is None else judged.static | (measured.confidence > STILL)
+        # A network's cue errs smoothly: what corrects it in a mask corrects what moves there, too.
+        correcting = static if self.is_interpolated else judged.static
+        known = known_depth(measured, judged.uv, judged.log_z, correcting, judged.cue.shape, judged.share)
+        like_moving = np.zeros_like(static)
+        if self.bleeding_px > 0 and not static.all():
+            beside = looks_moving(self.sequence.images[frame], self.sequence.masks[frame], self.size.shown(static))
+            like_moving = self.size.straight(beside)
         log_scale = float(self.scene["log_scale"][frame])
         return fuse_static(
-            judged.cue, measured, known, judged.errors.cue, judged.static, like_moving, log_scale, self.bleeding_px,
+            judged.cue, measured, known, judged.errors.cue, static, like_moving, log_scale, self.bleeding_px,
             self.config, frame in self.broken or self.is_interpolated,
         )  # fmt: skip
 

@@ -76,6 +76,22 @@ def test_a_mask_that_fits_is_left_alone(thing: np.ndarray, image: np.ndarray, rn
     np.testing.assert_array_equal(found, matched > 0.6)
 
 
+def test_one_mask_that_is_too_large_says_nothing_of_another(rng: np.random.Generator) -> None:
+    """The second thing is partly of the color of the wall, which only its own rim could tell from a mask too large."""
+    things = np.zeros((HEIGHT, 2 * WIDTH), np.int32)
+    things[12:38, 18:46], things[12:38, 82:110] = 1, 2
+    color = np.where((things > 0)[..., None], [170, 70, 70], [80, 80, 140])
+    color[16:22, 82:90] = 80, 80, 140
+    image = np.clip(color + rng.normal(0, 20, color.shape), 0, 255).astype(np.uint8)
+    mask = cv2.dilate((things == 1).astype(np.uint8), np.ones((11, 11), np.uint8)).astype(np.int32)
+    mask[things == 2] = 2
+    behind = seen_behind(image, things > 0, np.ones_like(things, bool), rng)
+    found = stands_still(compare(image, mask, behind), np.full(things.shape, 0.1, np.float32))
+    assert found[(mask == 1) & (things == 0)].mean() > 0.95
+    assert found[things == 1].mean() < 0.05
+    assert not found[things == 2].any()
+
+
 def test_where_no_frame_sees_what_is_behind_nothing_is_told(thing: np.ndarray, image: np.ndarray) -> None:
     nothing = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     behind = Background(nothing, nothing, nothing[..., 0], np.zeros_like(thing))

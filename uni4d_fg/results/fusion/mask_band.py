@@ -75,6 +75,8 @@ class Compared(NamedTuple):
     """(h, w, 3) of 1."""
     covered: Float32Array
     """Part of each pixel that is inside a mask."""
+    instance: Int32Array
+    """In whose."""
     like_background: Float32Array
     """Log likelihood that it is what other frames show there; means nothing where none does."""
     seen: BoolArray
@@ -90,7 +92,8 @@ def compare(image: ImageArray, mask: Int32Array, behind: Background) -> Compared
         behind: (h, w) in masks, and so far around them as they may miss.
     """
     small, covered = _shrunk(image, mask, behind.seen.shape)
-    return Compared(small, covered, _like_background(small, behind), behind.seen)
+    instance = cv2.resize(mask, covered.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return Compared(small, covered, np.asarray(instance, np.int32), _like_background(small, behind), behind.seen)
 
 
 def fitted_mask(compared: Compared, matched: Float32Array, *, tells_missed: bool) -> FittedMask:
@@ -126,8 +129,8 @@ def looks_moving(image: ImageArray, mask: Int32Array, static: BoolArray) -> Bool
 def stands_still(compared: Compared, matched: Float32Array) -> BoolArray:
     """Return which pixels inside masks stand still, as masks reach beyond what moves.
 
-    What several frames show with confidence does. Where the rim of a mask looks like what other frames show of the
-    still scene, the mask is too large. By how much is seen in how many pixels look so, the farther inside the fewer;
+    What several frames show with confidence does. Where the rim of an instance looks like what other frames show of the
+    still scene, its mask is too large. By how much is seen in how many pixels look so, the farther inside the fewer;
     each is then judged by that share, by its own colors, and by its confidence.
 
     Args:
@@ -152,14 +155,19 @@ def stands_still(compared: Compared, matched: Float32Array) -> BoolArray:
     # Where nothing deeper inside is near, the colors say nothing.
     told = seen & np.isfinite(like_behind)
     like_behind = np.where(told, np.clip(like_behind, -_LARGEST, _LARGEST), np.float32(0))
-    if float((like_behind[seen & (ring <= _RIM_PX)] > 0).mean()) < _RIM_STILL:
-        return still
-    share = _share_by_ring(ring, seen, like_behind > 0)
-    # Farther inside than the mask is too large, what looks like the scene behind only looks like it.
-    along &= ring <= np.count_nonzero(share >= _RIM_STILL)
-    odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
     confident = 2 * np.log(np.maximum(matched, np.float32(1e-3)) / np.float32(_USUAL))
-    return np.asarray(still | (along & (odds + _PER_COLOR * like_behind + _PER_CONFIDENCE * confident > 0)))
+    likely = _PER_COLOR * like_behind + _PER_CONFIDENCE * confident
+    for label in np.unique(compared.instance[seen]).tolist():
+        mine = seen & (compared.instance == label)
+        rim = like_behind[mine & (ring <= _RIM_PX)]
+        if len(rim) < _MIN_RIM or float((rim > 0).mean()) < _RIM_STILL:
+            continue
+        share = _share_by_ring(ring, mine, like_behind > 0)
+        # Farther inside than the mask is too large, what looks like the scene behind only looks like it.
+        reached = along & (compared.instance == label) & (ring <= np.count_nonzero(share >= _RIM_STILL))
+        odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
+        still |= reached & (odds + likely > 0)
+    return still
 
 
 def moves_beside(compared: Compared, matched: Float32Array) -> BoolArray:

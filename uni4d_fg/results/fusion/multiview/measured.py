@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, FloatArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.geometry.camera import world_to_camera
 from uni4d_fg.results.fusion.averaging import average_over_frames
@@ -90,27 +90,28 @@ class MultiviewDepth:
         sure = self.size.within(np.ones_like(own.inverse_depth), 0)
         return Measured(-np.log(own.inverse_depth), sure, relative_sigma(own.evidence))
 
-    def edges_again(self, frame: int, log_depth: Float32Array, sure: Float32Array) -> Float32Array:
+    def edges_again(self, frame: int, log_depth: Float32Array, sure: Float32Array, static: BoolArray) -> Float32Array:
         """Return log depth (h, w) of a frame with the edges of the static scene where other frames see them.
 
         Args:
             frame: The frame.
             log_depth: (h, w), NaN where missing.
             sure: (h, w) probability that it is right.
+            static: (h, w) where nothing moves.
         """
         near = [frame + sign * offset for offset in self.config.edge_offsets for sign in (-1, 1)]
         views = [number for number in near if 0 <= number < len(self.world_T_cam)]
         if not views:
             return log_depth
-        # What moves is nobody's match for long: where masks are too large, other frames are seen all the same.
         others = [
-            self._shown(view).gray * np.float32(factor)
+            self._shown(view).seen * np.float32(factor)
             for view, factor in zip(views, self._brightness(frame, views, self.seen(frame)), strict=True)
         ]
         known = np.isfinite(log_depth)
         inverse = np.exp(-np.where(known, log_depth, np.float32(0)))
         chosen = known & (sure < _UNSURE)
-        own, transfers = self._shown(frame).matched, self._transfers(frame, views)
+        own = np.where(static, self._shown(frame).gray, np.float32(np.nan))
+        transfers = self._transfers(frame, views)
         again = edges_again(inverse, own, chosen, others, transfers, self.threads)
         return np.where(again == inverse, log_depth, -np.log(again))
 
@@ -148,8 +149,9 @@ class MultiviewDepth:
         planes = choose_planes(z, transfers, sides, self.config)
         own = self._shown(frame)
         factors = self._brightness(frame, views, points)
-        matched = [self._shown(view).matched * np.float32(factor) for view, factor in zip(views, factors, strict=True)]
-        swept = sweep(own.gray, matched, transfers, planes, self.config, self.threads)
+        # What moves is left in: it matches nowhere for long, and masks that are too large hide what would.
+        seen = [self._shown(view).seen * np.float32(factor) for view, factor in zip(views, factors, strict=True)]
+        swept = sweep(own.gray, seen, transfers, planes, self.config, self.threads)
         step = np.float32(planes[1] - planes[0])
         return _Raw(
             self.size.continued(swept.inverse_depth), Evidence.of(swept, step / swept.inverse_depth, len(views))
@@ -165,7 +167,7 @@ class MultiviewDepth:
     def _brightness(self, frame: int, views: list[int], points: FloatArray) -> list[float]:
         """Return by how much gray values of other frames are to be multiplied to be as bright as a frame's."""
         own, *others = (
-            Shown(self._shown(number).matched, self.world_T_cam[number], self.cameras[number])
+            Shown(self._shown(number).static, self.world_T_cam[number], self.cameras[number])
             for number in (frame, *views)
         )
         return exposures(own, others, points)

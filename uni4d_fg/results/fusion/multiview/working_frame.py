@@ -1,4 +1,4 @@
-"""Frames at the size at which views are matched: gray, without what moves, and the camera of that size."""
+"""Frames at the size at which views are matched: gray, with and without what moves, and the camera of that size."""
 
 from __future__ import annotations
 
@@ -111,13 +111,15 @@ class WorkingFrame:
     """One frame, ready to be matched."""
 
     gray: Float32Array
-    """(h, w), 0 to 1."""
-    matched: Float32Array
+    """(h, w), 0 to 1; beyond what the image shows it goes on."""
+    seen: Float32Array
+    """(h, w) the same, NaN where the image shows nothing."""
+    static: Float32Array
     """(h, w) the same, NaN where something moves."""
 
 
 def working_frame(image: ImageArray, mask: Int32Array, size: WorkingSize, band_px: int) -> WorkingFrame:
-    """Shrink a frame and take out what moves, with a band around it.
+    """Shrink a frame, and take out what moves, with a band around it.
 
     Args:
         image: (H, W, 3) RGB.
@@ -127,7 +129,7 @@ def working_frame(image: ImageArray, mask: Int32Array, size: WorkingSize, band_p
     """
     gray = size.shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float32)) / np.float32(255.0)
     static = size.within(without_band(~size.marked(mask), band_px), False)
-    return WorkingFrame(gray, np.where(static, gray, np.float32(np.nan)))
+    return WorkingFrame(gray, size.within(gray, np.nan), np.where(static, gray, np.float32(np.nan)))
 
 
 def without_band(unmasked: BoolArray, band_px: int) -> BoolArray:
