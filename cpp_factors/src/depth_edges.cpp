@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstring>
 #include <limits>
 
 #include "pixel_place.hpp"
@@ -13,19 +14,19 @@ namespace uni4d_fg {
 
 namespace {
 
-constexpr int kNear = 4;    // half side of the window in which an edge is near, px
-constexpr int kRadius = 2;  // and of that which is compared
-constexpr int kSide = 2 * kRadius + 1;
-constexpr int kTaps = kSide * kSide;
+constexpr int kNear = 4;  // half side of the window in which an edge is near, px
 constexpr int kLanes = 8;
-constexpr int kPadded = (kTaps + kLanes - 1) / kLanes * kLanes;  // those beyond the window count nothing
-constexpr float kEdge = 0.1F;                                    // range of log depth from which on there is one
-constexpr std::array<int, 3> kReaches{2, 4, 7};                  // depths are tried of the pixels so far away, px
-constexpr float kAlike = 0.02F;                                  // log depths that differ by less are one
-constexpr float kLike = 0.08F;     // standard deviation of the weights by difference of gray values
-constexpr float kLargest = 0.15F;  // larger differences are all alike
-constexpr float kShown = 0.5F;     // a view that shows less of a window says nothing of it
-constexpr float kBetter = 0.002F;  // another depth than a pixel's own is better by this at least
+/// The window that is compared: every second pixel of 5x5, as on a chessboard, the nearest ones first.
+constexpr std::array<std::array<int, 2>, 13> kTaps{
+    {{0, 0}, {-1, -1}, {-1, 1}, {1, -1}, {1, 1}, {-2, 0}, {0, -2}, {0, 2}, {2, 0}, {-2, -2}, {-2, 2}, {2, -2}, {2, 2}}};
+constexpr int kPadded = (kTaps.size() + kLanes - 1) / kLanes * kLanes;  // those beyond the window count nothing
+constexpr float kEdge = 0.1F;                                           // range of log depth from which on there is one
+constexpr std::array<int, 3> kReaches{2, 4, 7};  // depths are tried of the pixels so far away, px
+constexpr float kAlike = 0.02F;                  // log depths that differ by less are one
+constexpr float kLike = 0.08F;                   // standard deviation of the weights by difference of gray values
+constexpr float kLargest = 0.15F;                // larger differences are all alike
+constexpr float kShown = 0.5F;                   // a view that shows less of a window says nothing of it
+constexpr float kBetter = 0.002F;                // another depth than a pixel's own is better by this at least
 
 /// The pixels around one: where they are, their gray values, and how much they count.
 struct Window {
@@ -39,7 +40,7 @@ constexpr float kNothing = std::numeric_limits<float>::infinity();
 UNI4D_FG_CLONES float unlikeness(const Window& window, const SweepView& view, int height, int width, float rho) {
   const float* t = view.turn;
   const float x0 = rho * view.shift[0], y0 = rho * view.shift[1], z0 = rho * view.shift[2];
-  float p[kPadded], q[kPadded], around[4][kPadded];
+  float p[kPadded], q[kPadded], top[2 * kPadded], low[2 * kPadded];
   int at[kPadded], inside[kPadded];
   for (int k = 0; k < kPadded; ++k) {
     const float u = window.u[k], v = window.v[k];
@@ -52,30 +53,24 @@ UNI4D_FG_CLONES float unlikeness(const Window& window, const SweepView& view, in
     inside[k] = place.shown;
   }
   for (int k = 0; k < kPadded; ++k) {
-    const float *top = view.image + at[k], *low = top + width;
-    around[0][k] = top[0];
-    around[1][k] = top[1];
-    around[2][k] = low[0];
-    around[3][k] = low[1];
+    std::memcpy(&top[2 * k], view.image + at[k], 2 * sizeof(float));
+    std::memcpy(&low[2 * k], view.image + at[k] + width, 2 * sizeof(float));
   }
-  float totals[kLanes] = {}, shares[kLanes] = {};
-  for (int k = 0; k < kPadded; k += kLanes)
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const int n = k + lane;
-      const float above = around[0][n] * (1.0F - p[n]) + around[1][n] * p[n];
-      const float below = around[2][n] * (1.0F - p[n]) + around[3][n] * p[n];
-      const float value = above * (1.0F - q[n]) + below * q[n], difference = std::abs(value - window.gray[n]);
-      const bool known = (inside[n] != 0) & (difference == difference);
-      const float weight = known ? window.weight[n] : 0.0F;
-      shares[lane] += weight;
-      totals[lane] += weight * (difference < kLargest ? difference : kLargest);
+  float totals[kPadded], shares[kPadded];
+  for (int k = 0; k < kPadded; ++k) {
+    const float above = top[2 * k] * (1.0F - p[k]) + top[2 * k + 1] * p[k];
+    const float below = low[2 * k] * (1.0F - p[k]) + low[2 * k + 1] * p[k];
+    const float value = above * (1.0F - q[k]) + below * q[k], difference = std::abs(value - window.gray[k]);
+    const bool known = (inside[k] != 0) & (difference == difference);
+    shares[k] = known ? window.weight[k] : 0.0F;
+    totals[k] = shares[k] * (difference < kLargest ? difference : kLargest);
+  }
+  for (int half = kPadded / 2; half > 0; half /= 2)
+    for (int k = 0; k < half; ++k) {
+      totals[k] += totals[k + half];
+      shares[k] += shares[k + half];
     }
-  float total = 0.0F, share = 0.0F;
-  for (int lane = 0; lane < kLanes; ++lane) {
-    total += totals[lane];
-    share += shares[lane];
-  }
-  return share >= kShown ? total / share : kNothing;
+  return shares[0] >= kShown ? totals[0] / shares[0] : kNothing;
 }
 
 class Edges {
@@ -149,8 +144,8 @@ class Edges {
     Window window{};
     const float own = image_[at(y, x)];
     float total = 0.0F;
-    for (int k = 0; k < kTaps; ++k) {
-      const int v = y + k / kSide - kRadius, u = x + k % kSide - kRadius;
+    for (std::size_t k = 0; k < kTaps.size(); ++k) {
+      const int v = y + kTaps[k][0], u = x + kTaps[k][1];
       window.u[k] = static_cast<float>(u);
       window.v[k] = static_cast<float>(v);
       if (!has(v, u) || !std::isfinite(image_[at(v, u)])) continue;
