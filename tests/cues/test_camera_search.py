@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.structure import camera_search, motion
 from uni4d_fg.cues.structure.camera_search import FoundCamera, is_lens
+from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import structure_from_motion
 from uni4d_fg.cues.structure.rivals import Rival
 from uni4d_fg.cues.track_motion import QuadraticGrid, SharedError
@@ -46,6 +48,26 @@ def test_a_lens_is_found_from_tracks_alone(k1: float) -> None:
 def test_a_pinhole_that_does_not_zoom_is_left_one(path, moving: int) -> None:  # type: ignore[no-untyped-def]
     scene = tracked(path(FRAMES), points=1500, moving=moving)
     assert structure(scene).camera.is_plain
+
+
+@pytest.mark.parametrize(("zoom", "count"), [(1.0, 0), (1.6, 1)])
+def test_cameras_are_grown_anew_only_where_those_at_hand_may_hide_a_zoom(
+    zoom: float, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = list[int]()
+    trial = motion._Search.trial
+
+    def counted(self: motion._Search, *arguments: Any) -> GrowingScene | None:
+        calls.append(1)
+        return trial(self, *arguments)
+
+    monkeypatch.setattr(motion._Search, "trial", counted)
+    monkeypatch.setattr(camera_search, "asks_for_zoom", lambda *_: True)
+    found = structure(through(tracked(sideways(FRAMES), points=1500), CameraModel(K, zoom=ramp(zoom))))
+    assert len(calls) == count
+    assert (found.camera.zoom is not None) is (zoom > 1.0)
+    if found.camera.zoom is not None:
+        np.testing.assert_allclose(found.intrinsics[0] * found.camera.zoom, K[0] * ramp(zoom), rtol=0.03)
 
 
 def test_a_search_that_fails_leaves_the_pinhole(monkeypatch: pytest.MonkeyPatch) -> None:

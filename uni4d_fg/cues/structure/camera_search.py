@@ -91,13 +91,13 @@ def find_camera(
     part = plain.scene
     if not part.good.any():
         return None
-    starts = [proposed] if proposed is not None and proposed.zoom is not None else []
-    if asks_for_zoom(plain, config):
-        starts.append(similar_zoom(scene, image_size))
+    if proposed is not None and proposed.zoom is None:
+        proposed = None
+    similar = similar_zoom(scene, image_size) if asks_for_zoom(plain, config) else None
     asks_for_lens = settings.model == "auto" and (
         fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
-    if not (starts or asks_for_lens):
+    if proposed is None and similar is None and not asks_for_lens:
         return None
     judge = TrackJudge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
     best, gain, open_focal = plain, 0.0, tuple[float, ...]()
@@ -106,8 +106,8 @@ def find_camera(
         gain = judge.better(lens, plain)[0]
         if is_lens(lens.camera, image_size, gain, config) and halves_agree_on_lens(lens, image_size, config):
             best = lens
-    if starts:
-        zoom = find_zoom(starts, plain, judge, scene, real, config, grown)
+    if proposed is not None or similar is not None:
+        zoom = find_zoom(proposed, similar, plain, judge, scene, real, config, grown)
         if zoom is not None and settings.zoom == "on":
             best = zoom
         elif zoom is not None and may_be_zoom(zoom, best, judge, config):

@@ -181,8 +181,7 @@ def structure_from_motion(
         try:
             found = find_camera(
                 grown.scene, observations, image_size, config,
-                lambda ideal, known: None if (new := quiet.grow(ideal, known, False)) is None else new.scene, proposed,
-                blur_px,
+                quiet.trial, proposed, blur_px,
             )  # fmt: skip
         except SolverError:  # That of another camera is no reason to do without this one.
             found = None
@@ -258,15 +257,20 @@ class _Search:
     should_stop: Callable[[], bool]
     start: StartCameras | None = None
 
-    def grow(self, observations: Observations, intrinsics: FloatArray, free_focal: bool) -> _Grown | None:
-        """Let starts compete, and grow and trim the best; None if no two frames have parallax, but for what passes."""
+    def grow(
+        self, observations: Observations, intrinsics: FloatArray, free_focal: bool, *, is_trial: bool = False
+    ) -> _Grown | None:
+        """Let starts compete, and grow and trim the best; None if no two frames have parallax, but for what passes.
+
+        Whether something that passes was taken for the world is not asked of a trial, which is judged beside others.
+        """
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
         found = self._grown(used, intrinsics, free_focal)
         closer = with_smaller_angles(self.config, float(intrinsics[0]))
         if found is None and closer != self.config:  # The camera may hardly move.
             found = replace(self, config=closer)._grown(used, intrinsics, free_focal)
-        rest = None if found is None else most_left_over(found.scene, used, self.image_size)
+        rest = None if found is None or is_trial else most_left_over(found.scene, used, self.image_size)
         if found is None or rest is None:
             return found
         world = _if_solved(lambda: replace(self, start=None)._grown(rest, intrinsics, free_focal))
@@ -274,6 +278,11 @@ class _Search:
             return replace(world, used=used)
         turns = only_seems_to_turn(rest, self.num_frames, intrinsics, settings, known_focal=not free_focal)
         return None if turns else found
+
+    def trial(self, observations: Observations, intrinsics: FloatArray) -> GrowingScene | None:
+        """Return what grows with focal lengths that are held, to be judged beside others; None if nothing does."""
+        grown = self.grow(observations, intrinsics, free_focal=False, is_trial=True)
+        return None if grown is None else grown.scene
 
     def _grown(self, used: Observations, intrinsics: FloatArray, free_focal: bool) -> _Grown | None:
         settings = self.config.geometric_depth
