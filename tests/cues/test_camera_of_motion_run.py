@@ -76,6 +76,7 @@ def test_a_lens(scene: Sequence, tmp_path: Path) -> None:
     video = frames_of(warped)
     sequence = solved(video, tmp_path)
     result = load_reconstruction(RunFolder(tmp_path / "run").reconstruction)
+    assert sequence.masks_from_motion
     assert result.lens == sequence.lens
     assert result.lens.parameters[0] == pytest.approx(-0.15, abs=0.02)
     assert warped.ground_truth.intrinsics is not None

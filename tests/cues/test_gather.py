@@ -378,6 +378,7 @@ def test_without_any_cue_depth_comes_from_motion_and_is_called_not_metric(tmp_pa
     assert not report.metric
     assert report.warnings[0] == NOT_METRIC
     assert sequence.depth_parallax
+    assert not sequence.masks_from_motion
     assert sequence.initial_world_T_cam is not None
     assert all(np.isfinite(depth).all() for depth in sequence.depths)
     assert error_up_to_scale(sequence, video) < 0.04

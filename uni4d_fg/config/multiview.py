@@ -44,7 +44,7 @@ class MultiviewConfig(Section):
     edge_contrast: float = setting(0.03, "A difference between gray values, of 1, that halves these costs.", gt=0)
     mask_band_px: int = setting(
         3,
-        "Width of the band around masks that is not taken for still scene unless several frames show it, working px.",
+        "Width of the band around masks that is taken to move as they are, working px.",
         ge=0,
     )
     compared_offsets: tuple[int, ...] = setting(

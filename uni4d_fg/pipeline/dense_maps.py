@@ -72,7 +72,7 @@ class _Made(NamedTuple):
     log_cue: Float32Array
     """Before anything was done to it."""
     unmasked: BoolArray
-    """Outside of masks, or shown to stand still by several frames."""
+    """Outside of masks, or in masks from motion and shown to stand still by several frames."""
     static: BoolArray
     """The same without a band around masks."""
     color: Float32Array
@@ -233,7 +233,7 @@ class DenseMaps:
             filled = np.where(shown, -np.log(np.where(shown, behind.inverse, np.float32(1))), filled)
             unmasked = unmasked & ~self.size.straight(fitted.missed)
             moving = fitted.applied(mask, self.size.plain)
-        sure[~unmasked] = 0
+        sure[~unmasked & (mine.depth.matched <= STILL)] = 0
         log_depth, sure = self.size.shown(filled), self.size.shown(self.size.continued(sure))
         if frame in self.broken or self.bleeding_px:
             log_depth = guided_median(log_depth, sure, self.size.shown(mine.static), self.sequence.images[frame])
@@ -367,7 +367,7 @@ class DenseMaps:
         if measured is not None and self.bleeding_px == 0:
             measured = without_edges(measured, judged.cue)
         fused = self._fused(frame, judged, measured)
-        still = fused.matched > STILL
+        still = self._stands_still(fused.matched)
         fused = replace(fused, log_depth=self.size.within(fused.log_depth, np.nan))
         with np.errstate(invalid="ignore"):
             inverse, log_cue = np.exp(-fused.log_depth), np.log(judged.cue)
@@ -400,7 +400,7 @@ class DenseMaps:
         return _Judged(cue, uv, log_z, share, unmasked, static, errors)
 
     def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
-        static = judged.static if measured is None else judged.static | (measured.confidence > STILL)
+        static = judged.static if measured is None else judged.static | self._stands_still(measured.confidence)
         # A network's cue errs smoothly: what corrects it in a mask corrects what moves there, too.
         correcting = static if self.is_interpolated else judged.static
         known = known_depth(measured, judged.uv, judged.log_z, correcting, judged.cue.shape, judged.share)
@@ -413,6 +413,14 @@ class DenseMaps:
             judged.cue, measured, known, judged.errors.cue, static, like_moving, log_scale, self.bleeding_px,
             self.config, frame in self.broken or self.is_interpolated,
         )  # fmt: skip
+
+    def _stands_still(self, confidence: Float32Array) -> BoolArray:
+        """Return what a mask may hide by mistake, (h, w): what several frames show with confidence.
+
+        What given masks hide may follow the camera, as a car does that is filmed from another: it would seem to stand
+        still farther away.
+        """
+        return np.asarray((confidence > STILL) & self.sequence.masks_from_motion)
 
     def _edge_profile(self, frame: int, judged: _Judged, measured: Measured) -> EdgeProfile | None:
         """Return how the cue of a frame differs from matched depth beside edges; None if there are none."""
@@ -469,8 +477,9 @@ class DenseMaps:
 
     def _working_frame(self, frame: int) -> WorkingFrame:
         return working_frame(
-            self.sequence.images[frame], self.sequence.masks[frame], self.size, self.config.multiview.mask_band_px
-        )
+            self.sequence.images[frame], self.sequence.masks[frame], self.size, self.config.multiview.mask_band_px,
+            hides=not self.sequence.masks_from_motion,
+        )  # fmt: skip
 
     def _landmarks(self, frame: int) -> FloatArray:
         points: FloatArray = self.control[frame].points[self.control[frame].instance == 0]

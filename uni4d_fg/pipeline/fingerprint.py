@@ -17,7 +17,7 @@ from uni4d_fg.optim.threads import map_in_order, thread_count
 _Check = Callable[[Any, tuple[int, int], str], np.ndarray]
 _CHECKS: dict[str, _Check] = {"image": checked_image, "depth": floating_depth, "mask": checked_mask}
 
-ALGORITHM_VERSION = 18
+ALGORITHM_VERSION = 19
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""
 
 
@@ -51,6 +51,8 @@ def sequence_digest(sequence: Sequence, should_stop: Callable[[], bool] | None =
     sources = [("image", sequence.images), ("depth", sequence.depths), ("mask", sequence.masks)]
     found = map_in_order(hashed, sources, thread_count())
     digest = hashlib.blake2b(b"".join(found), digest_size=16)
+    if sequence.masks_from_motion:
+        digest.update(b"masks from motion")
     add_array(digest, sequence.intrinsics)
     if not sequence.lens.is_pinhole:
         digest.update(sequence.lens.model.encode())

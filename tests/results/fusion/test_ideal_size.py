@@ -112,7 +112,7 @@ def test_frames_are_not_matched_where_the_image_does_not_reach(size: IdealSize, 
     image = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
     frame = working_frame(image, np.zeros((240, 320), np.int32), size, 3)
     assert np.isfinite(frame.gray).all()
-    np.testing.assert_array_equal(np.isfinite(frame.seen), size.inside)
+    np.testing.assert_array_equal(np.isfinite(frame.matched), size.inside)
     np.testing.assert_array_equal(np.isfinite(size.within(frame.gray, np.nan)), size.inside)
 
 

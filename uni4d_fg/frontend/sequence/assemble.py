@@ -140,6 +140,8 @@ class DepthNote(NamedTuple):
     """Found with the intrinsics."""
     zoom: FloatArray | None = None
     """See :attr:`~uni4d_fg.frontend.sequence.model.Video.zoom`."""
+    masks_from_motion: bool = False
+    """See :attr:`~uni4d_fg.frontend.sequence.model.Video.masks_from_motion`."""
 
 
 def load_depth_note(path: Path, num_frames: int) -> DepthNote:
@@ -147,7 +149,7 @@ def load_depth_note(path: Path, num_frames: int) -> DepthNote:
 
     Raises:
         InputError: If it does not say whether depth is in meters, of which kind the motion was that it is from,
-            how well that told the focal length, or which camera was found with it.
+            how well that told the focal length, which camera was found with it, or whether masks are from motion.
     """
     note = read_json(path)
     if not isinstance(note, dict) or not isinstance(note.get("metric"), bool):
@@ -167,9 +169,15 @@ def load_depth_note(path: Path, num_frames: int) -> DepthNote:
             path, f"has {sigma!r} for the standard deviation of the log focal length",
             'write "focal_sigma" as a number that is not negative, or leave it out',
         )  # fmt: skip
+    masks_from_motion = note.get("masks_from_motion", False)
+    if not isinstance(masks_from_motion, bool):
+        raise SequenceProblem(
+            path, f"has {masks_from_motion!r} for whether masks were found from motion",
+            'write "masks_from_motion": true, or leave it out',
+        )  # fmt: skip
     parallax = None if motion is None else motion["parallax"]
     lens, zoom = _noted_camera(note.get("camera"), path, num_frames)
-    return DepthNote(note["metric"], parallax, None if sigma is None else float(sigma), lens, zoom)
+    return DepthNote(note["metric"], parallax, None if sigma is None else float(sigma), lens, zoom, masks_from_motion)
 
 
 def _noted_camera(note: Any, path: Path, num_frames: int) -> tuple[Lens, FloatArray | None]:
@@ -242,6 +250,7 @@ def as_sequence(video: Video) -> Sequence:
         initial_world_T_cam=video.initial_world_T_cam,
         depth_is_metric=video.depth_is_metric,
         depth_parallax=video.depth_parallax,
+        masks_from_motion=video.masks_from_motion,
         focal_sigma=video.focal_sigma,
         tracks=video.tracks,
         lens=video.lens,
@@ -298,6 +307,7 @@ def assemble_video(files: SequenceFiles, stop: int | None = None) -> Video:
         depths=depths,
         depth_is_metric=note.metric,
         depth_parallax=note.parallax,
+        masks_from_motion=note.masks_from_motion,
         focal_sigma=note.focal_sigma,
         lens=note.lens,
         zoom=note.zoom,

@@ -114,6 +114,9 @@ class Video(_SelfCalibration):
     """Standard deviation of the log focal length where camera motion told the intrinsics; else None."""
     masks: FrameSource[Int32Array] | None = None
     """T label maps (H, W), int32."""
+    masks_from_motion: bool = False
+    """Whether masks were found from motion: what they hide by mistake is told by depth that several frames show. What
+    given masks hide may follow the camera, and seem to stand still farther away."""
     intrinsics: FloatArray | None = None
     """(4,) fx, fy, cx, cy in px."""
     lens: Lens = PINHOLE
@@ -170,6 +173,8 @@ class Sequence(_SelfCalibration):
     """Of depth that was found from camera motion alone: whether that showed parallax. None for other depth."""
     focal_sigma: float | None = None
     """Standard deviation of the log focal length where camera motion told the intrinsics; else None."""
+    masks_from_motion: bool = False
+    """See :attr:`Video.masks_from_motion`."""
     intrinsics_are_guessed: bool = False
     """Whether no intrinsics were given, and they are a guess from the size of the images."""
     tracks: Tracks | None = None

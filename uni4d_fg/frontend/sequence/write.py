@@ -85,6 +85,8 @@ def _write_cues(sequence: Sequence, folder: Path, names: tuple[str, ...]) -> Non
     note: dict[str, Any] = {"metric": sequence.depth_is_metric}
     if sequence.depth_parallax is not None:
         note["from_motion"] = {"parallax": sequence.depth_parallax}
+    if sequence.masks_from_motion:
+        note["masks_from_motion"] = True
     if sequence.focal_sigma is not None:
         note["focal_sigma"] = sequence.focal_sigma
     if not sequence.lens.is_pinhole or sequence.zoom is not None:

@@ -103,8 +103,9 @@ class MultiviewDepth:
         views = [number for number in near if 0 <= number < len(self.world_T_cam)]
         if not views:
             return log_depth
+        # What moves is nobody's match for long: where masks are too large, other frames are seen all the same.
         others = [
-            self._shown(view).seen * np.float32(factor)
+            self._shown(view).gray * np.float32(factor)
             for view, factor in zip(views, self._brightness(frame, views, self.seen(frame)), strict=True)
         ]
         known = np.isfinite(log_depth)
@@ -149,9 +150,8 @@ class MultiviewDepth:
         planes = choose_planes(z, transfers, sides, self.config)
         own = self._shown(frame)
         factors = self._brightness(frame, views, points)
-        # What moves is left in: it matches nowhere for long, and masks that are too large hide what would.
-        seen = [self._shown(view).seen * np.float32(factor) for view, factor in zip(views, factors, strict=True)]
-        swept = sweep(own.gray, seen, transfers, planes, self.config, self.threads)
+        matched = [self._shown(view).matched * np.float32(factor) for view, factor in zip(views, factors, strict=True)]
+        swept = sweep(own.gray, matched, transfers, planes, self.config, self.threads)
         step = np.float32(planes[1] - planes[0])
         return _Raw(
             self.size.continued(swept.inverse_depth), Evidence.of(swept, step / swept.inverse_depth, len(views))

@@ -112,13 +112,15 @@ class WorkingFrame:
 
     gray: Float32Array
     """(h, w), 0 to 1; beyond what the image shows it goes on."""
-    seen: Float32Array
-    """(h, w) the same, NaN where the image shows nothing."""
     static: Float32Array
-    """(h, w) the same, NaN where something moves."""
+    """(h, w) the same, NaN where something moves and where the image shows nothing."""
+    matched: Float32Array
+    """(h, w) the same, NaN where other frames find nothing of theirs."""
 
 
-def working_frame(image: ImageArray, mask: Int32Array, size: WorkingSize, band_px: int) -> WorkingFrame:
+def working_frame(
+    image: ImageArray, mask: Int32Array, size: WorkingSize, band_px: int, *, hides: bool = True
+) -> WorkingFrame:
     """Shrink a frame, and take out what moves, with a band around it.
 
     Args:
@@ -126,10 +128,12 @@ def working_frame(image: ImageArray, mask: Int32Array, size: WorkingSize, band_p
         mask: (H, W) 0 static.
         size: Where to.
         band_px: Width of the band, working px.
+        hides: Whether other frames are not matched with what the mask marks.
     """
     gray = size.shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float32)) / np.float32(255.0)
     static = size.within(without_band(~size.marked(mask), band_px), False)
-    return WorkingFrame(gray, size.within(gray, np.nan), np.where(static, gray, np.float32(np.nan)))
+    without = np.where(static, gray, np.float32(np.nan))
+    return WorkingFrame(gray, without, without if hides else size.within(gray, np.nan))
 
 
 def without_band(unmasked: BoolArray, band_px: int) -> BoolArray:
