@@ -284,6 +284,9 @@ def test_cues_in_files_of_their_own(tmp_path: Path) -> None:
     assert float(whole.depths[0][0, 0]) == 3.0
     assert int(whole.masks[0][0, 0]) == 7
     assert (whole.tracks.num_tracks, whole.intrinsics[0]) == (3, 80.0)
+    found = replace(video, masks_from_motion=True)  # those that it brought were; these are given
+    assert not files.attach(found).masks_from_motion
+    assert CueFiles(depth=files.depth).attach(found).masks_from_motion
     for name in ("depth", "masks", "tracks", "intrinsics"):
         with pytest.raises(InputError, match="nosuch"):
             CueFiles(**{name: tmp_path / "nosuch"}).attach(video)

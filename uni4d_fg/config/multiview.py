@@ -43,9 +43,7 @@ class MultiviewConfig(Section):
     large_step_penalty: int = setting(100, "Cost of one that is farther away, alike.", ge=0, le=1000)
     edge_contrast: float = setting(0.03, "A difference between gray values, of 1, that halves these costs.", gt=0)
     mask_band_px: int = setting(
-        3,
-        "Width of the band around masks that is taken to move as they are, working px.",
-        ge=0,
+        3, "Width of the band around masks that is taken to move as they are, working px.", ge=0
     )
     compared_offsets: tuple[int, ...] = setting(
         (2, 5), "Depth of a frame is compared with that of the frames this far before and after."

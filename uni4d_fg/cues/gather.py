@@ -148,7 +148,7 @@ class _Gathering:
                 intrinsics=None if guessed else self._best_intrinsics(),
                 initial_world_T_cam=self.world_T_cam, content=None, depth_is_metric=report.metric,
                 depth_parallax=self.depth_parallax, focal_sigma=self.focal_sigma,
-                masks_from_motion=self.video.masks_from_motion or plan.masks == "motion",
+                masks_from_motion=plan.masks == "motion" or (plan.masks == "given" and self.video.masks_from_motion),
                 lens=self.video.lens if self.camera is None else self.camera.lens, zoom=self._zoom(),
             )
         )  # fmt: skip

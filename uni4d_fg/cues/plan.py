@@ -59,6 +59,7 @@ class CueFiles:
             changes["masks"] = open_mask_files(
                 self.masks, size, count, video.frame_names, images=video.images, classes=self.classes
             )
+            changes["masks_from_motion"] = False
         if self.tracks is not None:
             changes["tracks"] = load_track_file(self.tracks, count).to_tracks(count, size)
         if self.intrinsics is not None:

@@ -367,7 +367,7 @@ class DenseMaps:
         if measured is not None and self.bleeding_px == 0:
             measured = without_edges(measured, judged.cue)
         fused = self._fused(frame, judged, measured)
-        still = self._stands_still(fused.matched)
+        still = self._hidden_by_mistake(fused.matched)
         fused = replace(fused, log_depth=self.size.within(fused.log_depth, np.nan))
         with np.errstate(invalid="ignore"):
             inverse, log_cue = np.exp(-fused.log_depth), np.log(judged.cue)
@@ -400,7 +400,7 @@ class DenseMaps:
         return _Judged(cue, uv, log_z, share, unmasked, static, errors)
 
     def _fused(self, frame: int, judged: _Judged, measured: Measured | None) -> StaticDepth:
-        static = judged.static if measured is None else judged.static | self._stands_still(measured.confidence)
+        static = judged.static if measured is None else judged.static | self._hidden_by_mistake(measured.confidence)
         # A network's cue errs smoothly: what corrects it in a mask corrects what moves there, too.
         correcting = static if self.is_interpolated else judged.static
         known = known_depth(measured, judged.uv, judged.log_z, correcting, judged.cue.shape, judged.share)
@@ -414,7 +414,7 @@ class DenseMaps:
             self.config, frame in self.broken or self.is_interpolated,
         )  # fmt: skip
 
-    def _stands_still(self, confidence: Float32Array) -> BoolArray:
+    def _hidden_by_mistake(self, confidence: Float32Array) -> BoolArray:
         """Return what a mask may hide by mistake, (h, w): what several frames show with confidence.
 
         What given masks hide may follow the camera, as a car does that is filmed from another: it would seem to stand

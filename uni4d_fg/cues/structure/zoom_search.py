@@ -78,9 +78,7 @@ def asks_for_zoom(plain: Fitted, config: Config) -> bool:
 
 def may_be_zoom(zoom: Fitted, best: Fitted, judge: TrackJudge, config: Config) -> bool:
     """Tell whether the focal length changes enough, alike for halves of the tracks, and explains all of them better."""
-    if np.expm1(np.ptp(_log_zoom(zoom))) < config.camera.min_zoom:
-        return False
-    return judge.better(zoom, best)[0] > 0.0 and halves_agree_on_zoom(zoom, config)
+    return _varies(zoom, config) and judge.better(zoom, best)[0] > 0.0 and halves_agree_on_zoom(zoom, config)
 
 
 def explains_most(zoom: Fitted, plain: Fitted, judge: TrackJudge, config: Config) -> bool:
@@ -109,24 +107,15 @@ def find_zoom(
         Cancelled: If asked to stop.
     """
 
-    def fitted(trials: list[Fitted]) -> list[Fitted]:
-        found = []
-        for trial in trials:
-            try:
-                found.append(judge.anew(fit_zoom(trial, config, _SHORT)))
-            except SolverError:  # That of one start is no reason to do without the others.
-                continue
-        return found
-
     def grown_anew(camera: CameraModel) -> list[Fitted]:
         other = grown(camera.ideal_observations(real), camera.intrinsics)
         if other is None:
             return []
         part = part_of(other, config.camera.observations, plain.scene.registered)
         part.free_focal = scene.free_focal
-        return fitted([Fitted(camera, part)])
+        return _fitted([Fitted(camera, part)], judge, config)
 
-    found = fitted([plain, *_mapped(plain, judge)])
+    found = _fitted([plain, *_mapped(plain, judge)], judge, config)
     if proposed is not None:
         found += grown_anew(proposed)
     if similar is not None and (config.camera.zoom == "on" or not _finds_none(found, judge, scene, config)):
@@ -149,13 +138,29 @@ def find_zoom(
     return best
 
 
+def _fitted(trials: list[Fitted], judge: TrackJudge, config: Config) -> list[Fitted]:
+    """Return the zooms that some cameras lead to in a few steps; those that cannot be solved are left out."""
+    found = []
+    for trial in trials:
+        try:
+            found.append(judge.anew(fit_zoom(trial, config, _SHORT)))
+        except SolverError:  # That of one start is no reason to do without the others.
+            continue
+    return found
+
+
 def _finds_none(found: list[Fitted], judge: TrackJudge, scene: GrowingScene, config: Config) -> bool:
     """Tell whether the best of some cameras hardly zooms, and that of a scene without zoom has a usual focal length."""
     if not found:
         return False
     ran_away = abs(np.log(scene.mean_focal / float(np.mean(scene.prior_intrinsics[:2])))) > np.log(_RUNS_AWAY)
     best = min(found, key=judge.cost)
-    return not ran_away and float(np.expm1(np.ptp(_log_zoom(best)))) < config.camera.min_zoom
+    return not (ran_away or _varies(best, config))
+
+
+def _varies(zoom: Fitted, config: Config) -> bool:
+    """Tell whether the focal length changes enough to be taken for a zoom."""
+    return bool(np.expm1(np.ptp(_log_zoom(zoom))) >= config.camera.min_zoom)
 
 
 def focal_range(zoom: Fitted) -> tuple[float, float]:

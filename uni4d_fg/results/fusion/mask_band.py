@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
+from uni4d_fg.cues.mask_distance import shrunk_mask
 from uni4d_fg.results.fusion.background import Background
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 from uni4d_fg.results.nearest import nearest_known
@@ -92,8 +93,8 @@ def compare(image: ImageArray, mask: Int32Array, behind: Background) -> Compared
         behind: (h, w) in masks, and so far around them as they may miss.
     """
     small, covered = _shrunk(image, mask, behind.seen.shape)
-    instance = cv2.resize(mask, covered.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return Compared(small, covered, np.asarray(instance, np.int32), _like_background(small, behind), behind.seen)
+    instance = shrunk_mask(mask, (covered.shape[0], covered.shape[1]))
+    return Compared(small, covered, instance, _like_background(small, behind), behind.seen)
 
 
 def fitted_mask(compared: Compared, matched: Float32Array, *, tells_missed: bool) -> FittedMask:
@@ -149,7 +150,7 @@ def stands_still(compared: Compared, matched: Float32Array) -> BoolArray:
     ring = np.ceil(depth).astype(np.int64)
     along = inside & (ring <= FARTHEST_PX)
     seen = along & compared.seen
-    if not deep.any() or np.count_nonzero(seen & (ring <= _RIM_PX)) < _MIN_RIM:
+    if not deep.any():
         return still
     like_behind = compared.like_background - _log_likelihood(compared.color, deep)
     # Where nothing deeper inside is near, the colors say nothing.
@@ -158,13 +159,13 @@ def stands_still(compared: Compared, matched: Float32Array) -> BoolArray:
     confident = 2 * np.log(np.maximum(matched, np.float32(1e-3)) / np.float32(_USUAL))
     likely = _PER_COLOR * like_behind + _PER_CONFIDENCE * confident
     for label in np.unique(compared.instance[seen]).tolist():
-        mine = seen & (compared.instance == label)
-        rim = like_behind[mine & (ring <= _RIM_PX)]
+        mine = along & (compared.instance == label)
+        rim = like_behind[mine & seen & (ring <= _RIM_PX)]
         if len(rim) < _MIN_RIM or float((rim > 0).mean()) < _RIM_STILL:
             continue
-        share = _share_by_ring(ring, mine, like_behind > 0)
+        share = _share_by_ring(ring, mine & seen, like_behind > 0)
         # Farther inside than the mask is too large, what looks like the scene behind only looks like it.
-        reached = along & (compared.instance == label) & (ring <= np.count_nonzero(share >= _RIM_STILL))
+        reached = mine & (ring <= np.count_nonzero(share >= _RIM_STILL))
         odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
         still |= reached & (odds + likely > 0)
     return still
