@@ -287,6 +287,20 @@ def test_cues_in_files_of_their_own(tmp_path: Path) -> None:
     found = replace(video, masks_from_motion=True)  # those that it brought were; these are given
     assert not files.attach(found).masks_from_motion
     assert CueFiles(depth=files.depth).attach(found).masks_from_motion
+    poses = np.tile(np.eye(4), (T, 1, 1))
+    own = replace(
+        video, depth_is_metric=False, depth_parallax=True, focal_sigma=0.1, initial_world_T_cam=poses
+    )  # what that depth and those intrinsics were is not what these are
+    with_depth, with_intrinsics = (
+        CueFiles(depth=files.depth).attach(own),
+        CueFiles(intrinsics=files.intrinsics).attach(own),
+    )
+    assert (with_depth.depth_is_metric, with_depth.depth_parallax, with_depth.focal_sigma) == (True, None, 0.1)
+    assert with_depth.initial_world_T_cam is None
+    assert (with_intrinsics.depth_is_metric, with_intrinsics.depth_parallax) == (False, True)
+    assert with_intrinsics.focal_sigma is None
+    assert with_intrinsics.initial_world_T_cam is poses
+    assert CueFiles(depth=files.depth).attach(replace(own, depth_is_metric=True)).initial_world_T_cam is poses
     for name in ("depth", "masks", "tracks", "intrinsics"):
         with pytest.raises(InputError, match="nosuch"):
             CueFiles(**{name: tmp_path / "nosuch"}).attach(video)

@@ -52,7 +52,10 @@ class CueFiles:
             depths = open_depth(self.depth, size)
             check_count(self.depth, len(depths), count)
             depths[0]
-            changes["depths"] = depths
+            # What the video's own depth was says nothing of this one, and cameras in its unit do not fit it.
+            changes |= {"depths": depths, "depth_is_metric": True, "depth_parallax": None}
+            if not video.depth_is_metric:
+                changes["initial_world_T_cam"] = None
         if self.masks is not None:
             from uni4d_fg.cues.mask_files import open_mask_files  # takes a second to load
 
@@ -64,7 +67,9 @@ class CueFiles:
             changes["tracks"] = load_track_file(self.tracks, count).to_tracks(count, size)
         if self.intrinsics is not None:
             calibration = load_calibration(self.intrinsics, count, size)
-            changes |= {"intrinsics": calibration.intrinsics, "lens": calibration.lens, "zoom": None}
+            changes |= {
+                "intrinsics": calibration.intrinsics, "lens": calibration.lens, "zoom": None, "focal_sigma": None
+            }  # fmt: skip
         return replace(video, **changes)
 
     def __bool__(self) -> bool:

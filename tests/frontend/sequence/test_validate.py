@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -92,6 +93,23 @@ def test_depth_that_is_missing_or_in_the_wrong_unit(tmp_path: Path) -> None:
     sparse[:, :3] = 1
     np.save(root / "depth.npy", sparse)
     assert [m for _, m in said_of(root, "depth", "warning")] == [f"{root / 'depth.npy'}: 75 % of the depth is missing"]
+
+
+def test_what_is_noted_of_the_depth(tmp_path: Path) -> None:
+    root = native_folder(tmp_path)
+    shutil.rmtree(root / "depth_cue")
+    np.save(root / "depth.npy", np.full((FRAMES, HEIGHT, WIDTH), 0.01, np.float32))
+    limits = InputConfig(min_depth_m=0.001)
+    (odd,) = validate_sequence(root, limits=limits).of("warning")
+    assert "the median depth is outside 0.05 to 200 m" in odd.message
+    note = root / "depth_cue.json"
+    note.write_text('{"metric": false}')
+    report = validate_sequence(root, limits=limits)
+    assert not report.of("warning")
+    assert f"{note}: depth is in a unit of its own" in [f.message for f in report.of("info")]
+    note.write_text('{"metric": false, "focal_sigma": -1}')
+    (error,) = validate_sequence(root, limits=limits).of("error")
+    assert (error.item, "has -1 for the standard deviation" in error.message) == ("depth", True)
 
 
 def said_of(root: Path, depth: str, severity: str) -> list[tuple[str, str]]:

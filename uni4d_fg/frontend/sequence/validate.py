@@ -98,11 +98,14 @@ class _Validation:
         self.num_frames: int | None = None
         self.image_stems: list[str] | None = None
         self.num_tracks: int | None = None
+        self.metric = True
 
     def run(self) -> None:
         files = self.files
         if files.images is not None:
             self._images(files.images)
+        if files.depth_note is not None and self.num_frames is not None:
+            self._depth_note(files.depth_note, self.num_frames)
         if files.depth is not None:
             self._depth("depth", files.depth, 1000.0)
         elif files.no_depth is not None and not files.problems:
@@ -194,6 +197,14 @@ class _Validation:
                 "none",
             )
 
+    def _depth_note(self, path: Path, num_frames: int) -> None:
+        note = self.findings.attempt("depth", lambda: assemble.load_depth_note(path, num_frames))
+        if note is not None and not note.metric:
+            self.metric = False
+            self.findings.add(
+                "info", "depth", f"{path}: depth is in a unit of its own", "none: lengths are in that unit"
+            )
+
     def _depth(self, item: str, path: Path, units_per_meter: float) -> None:
         frames = self.findings.attempt(item, lambda: assemble.open_depth(path, self.size, units_per_meter))
         if frames is None:
@@ -214,7 +225,8 @@ class _Validation:
                 empty.append(frame)
                 return
             medians.append(float(np.median(known)))
-            if not PLAUSIBLE_DEPTH[0] <= medians[-1] <= PLAUSIBLE_DEPTH[1]:
+            in_meters = self.metric or item != "depth"
+            if in_meters and not PLAUSIBLE_DEPTH[0] <= medians[-1] <= PLAUSIBLE_DEPTH[1]:
                 odd.append(frame)
 
         scan_frames(item, frames, self.findings, visit, self._chosen(frames))
