@@ -61,7 +61,9 @@ void guided_median(const WeightedMap& map, const std::uint8_t* chosen, const Med
           if (x + dx < 0 || x + dx >= map.width || !(map.weights[at] > 0.0F)) continue;
           const float* other = map.colors + 3 * at;
           const float r = other[0] - color[0], g = other[1] - color[1], b = other[2] - color[2];
-          values[count] = map.values[at];
+          const float* slope = map.slopes + 2 * at;
+          const float back = -(static_cast<float>(dy) * slope[0] + static_cast<float>(dx) * slope[1]);
+          values[count] = map.values[at] * (1.0F + std::clamp(back, -window.steepest, window.steepest));
           weights[count] = map.weights[at];
           unlike[count] = r * r + g * g + b * b + scale * static_cast<float>(dy * dy + dx * dx);
           ++count;

@@ -1,8 +1,10 @@
-"""Edges of depth brought to those of the image, where depth is not sure: a weighted median.
+"""Edges of depth brought to those of the image, where depth is not sure: a weighted median of the surfaces around.
 
 A pixel that is not sure takes the median of the depths around, weighted by how near they are, by how much their color
 is like its own, and by how sure they are (Ma et al. 2013, "Constant time weighted median filtering for stereo matching
-and beyond"). Unlike a mean, a median of two surfaces is one of them.
+and beyond"). Unlike a mean, a median of two surfaces is one of them. Each pixel around stands for the plane through it,
+continued to the pixel in question: else ground that goes far, sure where it is near, would come nearer. The inverse
+depth of a plane is linear in the image, so that a slope is all that a plane needs.
 """
 
 from __future__ import annotations
@@ -15,9 +17,9 @@ from uni4d_fg.optim.extension import find_extension
 
 _UNSURE = 0.5
 """Pixels of a lower confidence are replaced."""
-_REACH_PX, _STEP_PX = 4, 2
-"""Every second pixel of a window of this half side is looked at."""
-_SPATIAL_PX = 3.0
+_REACH_PX, _STEP_PX = 12, 4
+"""Every fourth pixel of a window of this half side is looked at: rims of what is near are up to ten wide."""
+_SPATIAL_PX = 6.0
 """Standard deviation of the weights by distance ..."""
 _COLOR = 0.05
 """... and of those by color, of 1."""
@@ -25,6 +27,12 @@ _LEAST = np.float32(1e-3)
 """Weight of depth that is not sure at all, beside that of sure depth."""
 _FARTHEST = np.float32(60.0)
 """Exponent beyond which pixels are equally unlike."""
+_STEEPEST = np.float32(0.3)
+"""A plane changes inverse depth by at most this part on its way to a pixel."""
+_SLOPE_WINDOW = (11, 11)
+"""Slopes are means over such windows ..."""
+_ONE_SURFACE = np.float32(0.05)
+"""... of the differences of neighbors whose log depth differs by less."""
 
 
 def guided_median(
@@ -46,30 +54,55 @@ def guided_median(
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     colors = small.astype(np.float32) / np.float32(255 * np.sqrt(2.0) * _COLOR)
     weights = np.where(known, confidence + _LEAST, np.float32(0)).astype(np.float32)
+    inverse = np.exp(-np.where(known, log_depth, np.float32(0))).astype(np.float32)
+    slopes = slopes_of(inverse, weights)
     core, _ = find_extension()
     if core is None:
-        return guided_median_numpy(log_depth, weights, colors, chosen)
-    found: Float32Array = core.guided_median(
-        np.ascontiguousarray(log_depth, dtype=np.float32), weights, colors, chosen.astype(np.uint8),
-        reach=_REACH_PX, step=_STEP_PX, spatial=_SPATIAL_PX,
-    )  # fmt: skip
-    return found
+        found = guided_median_numpy(inverse, weights, slopes, colors, chosen)
+    else:
+        found = core.guided_median(
+            inverse, weights, slopes, colors, chosen.astype(np.uint8), reach=_REACH_PX, step=_STEP_PX,
+            spatial=_SPATIAL_PX, steepest=float(_STEEPEST),
+        )  # fmt: skip
+    return np.where(chosen, -np.log(found), log_depth)
+
+
+def slopes_of(inverse: Float32Array, weights: Float32Array) -> Float32Array:
+    """Return by what part inverse depth grows from a pixel to the one below and to the one on its right, (h, w, 2).
+
+    Args:
+        inverse: (h, w) inverse depth, positive.
+        weights: (h, w), 0 where it is missing.
+    """
+    limit = 1 + _ONE_SURFACE
+    slopes = np.zeros((*inverse.shape, 2), np.float32)
+    for axis in (0, 1):
+        # Neighbors, along the axis; the last row or column has none.
+        here, there = (slice(None, -1), slice(1, None)) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        one, other = inverse[here], inverse[there]
+        sure = np.minimum(weights[here], weights[there]) * ((other < limit * one) & (one < limit * other))
+        grows, total = np.zeros_like(inverse), np.zeros_like(inverse)
+        grows[here], total[here] = sure * (other - one), sure
+        mean = cv2.blur(grows, _SLOPE_WINDOW) / np.maximum(cv2.blur(total, _SLOPE_WINDOW), _LEAST)
+        slopes[..., axis] = mean / inverse
+    return slopes
 
 
 def guided_median_numpy(
-    values: Float32Array, weights: Float32Array, colors: Float32Array, chosen: BoolArray
+    values: Float32Array, weights: Float32Array, slopes: Float32Array, colors: Float32Array, chosen: BoolArray
 ) -> Float32Array:
     """Do what ``cpp_factors/src/guided_median.cpp`` does.
 
     Args:
         values: (h, w), finite where they weigh anything.
         weights: (h, w), 0 where the map is missing.
+        slopes: (h, w, 2) by what part values grow from a pixel to the one below and to the one on its right.
         colors: (h, w, 3) in units of sqrt(2) standard deviations of the weights by color.
         chosen: (h, w) pixels that take the median.
     """
     height, width = values.shape
     row, column = np.nonzero(chosen)
-    color, weight = colors.reshape(-1, 3), weights.ravel()
+    color, weight, slope = colors.reshape(-1, 3), weights.ravel(), slopes.reshape(-1, 2)
     value, own = np.where(weights > 0, values, np.float32(0)).ravel(), color[row * width + column]
     taps = range(-_REACH_PX, _REACH_PX + 1, _STEP_PX)
     around = np.empty((len(taps) ** 2, row.size), np.float32)
@@ -78,7 +111,8 @@ def guided_median_numpy(
         inside = (row + dy >= 0) & (row + dy < height) & (column + dx >= 0) & (column + dx < width)
         at = np.where(inside, (row + dy) * width + column + dx, 0)
         unlike = ((color[at] - own) ** 2).sum(axis=1) + np.float32((dy * dy + dx * dx) / (2 * _SPATIAL_PX**2))
-        around[number] = value[at]
+        back = -(np.float32(dy) * slope[at, 0] + np.float32(dx) * slope[at, 1])
+        around[number] = value[at] * (1 + np.clip(back, -_STEEPEST, _STEEPEST))
         weighed[number] = np.where(inside, weight[at] * np.exp(-np.minimum(unlike, _FARTHEST)), np.float32(0))
     order = np.argsort(around, axis=0)
     mass = np.cumsum(np.take_along_axis(weighed, order, axis=0), axis=0)
