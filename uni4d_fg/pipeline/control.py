@@ -12,7 +12,7 @@ from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.frontend.track_model import LabelledTracks
 from uni4d_fg.geometry.camera import world_to_camera
-from uni4d_fg.pipeline.landmark_sigma import landmark_shares
+from uni4d_fg.pipeline.landmark_sigma import common_sigma, landmark_shares, variance_of_rays
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.results.fusion.densify import ControlPoints
 from uni4d_fg.slam.stages.contradicting_depth import contradicting_frames
@@ -26,6 +26,8 @@ class StaticControl:
     """The landmarks that each frame sees with a cue."""
     broken: list[int]
     """Frames whose cue contradicts them."""
+    sigma: float
+    """Standard deviation of log depth that is made of them alone."""
 
 
 def static_control(
@@ -39,7 +41,8 @@ def static_control(
         intrinsics: (T, 4) px.
         config: When a cue counts as broken.
     """
-    shares = landmark_shares(labelled, scene, intrinsics)
+    variance = variance_of_rays(labelled, scene, intrinsics)
+    shares = landmark_shares(labelled, scene, intrinsics, variance)
     track: IntArray = scene["landmark_track"]
     frames = []
     for frame, pose in enumerate(scene["world_T_cam"]):
@@ -47,7 +50,8 @@ def static_control(
         points: FloatArray = scene["landmarks"][seen]
         instance: Int32Array = np.zeros(len(points), dtype=np.int32)
         frames.append(_points(labelled, track[seen], points, instance, shares[seen], frame, pose))
-    return StaticControl(frames, contradicting_frames([(points.cue, points.log_scale) for points in frames], config))
+    broken = contradicting_frames([(points.cue, points.log_scale) for points in frames], config)
+    return StaticControl(frames, broken, common_sigma(variance))
 
 
 def with_moving(

@@ -32,6 +32,7 @@ from uni4d_fg.results.fusion.static_depth import (
     fuse_static,
     held_out_errors,
     known_depth,
+    probability_right,
     without_edges,
 )
 from uni4d_fg.results.fusion.told_error import final_confidence
@@ -115,6 +116,8 @@ class DenseMaps:
     threads: int
     size: WorkingSize
     """Of what is done before depth is brought to the size of the images."""
+    landmark_sigma: float = 0.0
+    """Standard deviation of log depth that is made of landmarks alone."""
     multiview: MultiviewDepth = field(init=False)
     bleeding_px: float = 0.0
     """How far the cue bleeds across edges, working px."""
@@ -223,6 +226,7 @@ class DenseMaps:
         averaged = self._averaged(frame)
         averaged = averaged._replace(log_depth=self.size.continued(averaged.log_depth))
         sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
+        sure *= probability_right(np.float32(self.common_sigma(frame)))
         filled, moving, unmasked = averaged.log_depth, mask, mine.unmasked
         if self.prefers_matching and self.is_interpolated:
             filled = smoothed_where_unsure(filled, np.where(unmasked, sure, np.float32(0)), mine.color)
@@ -246,6 +250,10 @@ class DenseMaps:
         if (moving > 0).any():
             full[moving > 0] = np.exp(self._moving(frame, given, moving)[moving > 0])
         return full, FinalStatic(log_depth, sure, self.size.shown(unmasked))
+
+    def common_sigma(self, frame: int) -> float:
+        """Return the standard deviation of log depth that a frame shares with those it is compared with."""
+        return self.landmark_sigma if self.is_interpolated and frame not in self.matched else 0.0
 
     def _averaged(self, frame: int) -> Averaged:
         """Average a frame's static depth with that of the frames near it.

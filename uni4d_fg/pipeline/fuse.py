@@ -94,6 +94,7 @@ def fuse_depth(
         _unmatchable(config, zoom is not None and not lens.is_pinhole, size, sequence.depth_parallax),
         thread_count(),
         size or plain,
+        landmark_sigma=known.sigma,
     )
     maps.try_matching()
     told = ToldError(maps.is_interpolated, float(scene.get("focal_depth_error", 0.0)))

@@ -39,5 +39,8 @@ def fused_frames(maps: DenseMaps, first: int, stop: int) -> Iterator[FusedFrame]
                 if static is None:
                     yield FusedFrame(frame, depth, None, told)
                     continue
-                told.add(static.log_depth, static.confidence, static.still, *maps.landmarks_in(frame))
+                told.add(
+                    static.log_depth, static.confidence, static.still, *maps.landmarks_in(frame),
+                    common_sigma=maps.common_sigma(frame),
+                )  # fmt: skip
                 yield FusedFrame(frame, depth, in_steps(static.confidence), told)

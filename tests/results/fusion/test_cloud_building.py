@@ -145,3 +145,15 @@ def test_points_that_are_not_sure_are_no_part_of_the_static_cloud() -> None:
     everything = PLAIN.model_copy(update={"cloud_confidence": 0.0})
     again = static_cloud(images, depths, masks, INTRINSICS, poses, everything, confidence=ArrayFrames(unsure))
     assert len(again.points) == len(whole.points)
+
+
+def test_where_next_to_none_are_sure_the_surer_half_is_taken() -> None:
+    images, depths, masks, poses = video()
+    whole = static_cloud(images, depths, masks, INTRINSICS, poses, PLAIN)
+    confidence = np.full((FRAMES, HEIGHT, WIDTH), 0.05, np.float32)
+    confidence[:, :, : WIDTH // 2] = 0.12
+    unsure = static_cloud(images, depths, masks, INTRINSICS, poses, PLAIN, confidence=ArrayFrames(confidence))
+    assert 0.3 * len(whole.points) < len(unsure.points) < 0.6 * len(whole.points)
+    confidence[0, :4] = 0.9  # a thirtieth of the video is enough to leave out all else
+    some = static_cloud(images, depths, masks, INTRINSICS, poses, PLAIN, confidence=ArrayFrames(confidence))
+    assert 0 < len(some.points) <= 4 * WIDTH

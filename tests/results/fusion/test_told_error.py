@@ -72,6 +72,13 @@ def test_without_static_pixels_no_error_is_told_and_without_landmarks_the_usual_
     assert told.mean() == pytest.approx(np.hypot(0.0025, 0.01)), "what the focal length leaves open comes on top"
 
 
+def test_an_error_that_all_frames_share_comes_on_top() -> None:
+    told, everywhere = ToldError(from_motion=True), np.ones(SHAPE, bool)
+    sure = np.full(SHAPE, 0.2, np.float32)
+    told.add(np.zeros(SHAPE, np.float32), sure, everywhere, np.zeros((0, 2)), np.zeros(0), common_sigma=0.2)
+    assert told.mean() == pytest.approx(np.hypot(0.066, 0.2 * np.sqrt(2 / np.pi)), rel=1e-5)
+
+
 def test_depth_interpolated_between_points_is_farther_off_where_it_is_as_sure() -> None:
     """Two thirds of the pixels are quite sure, a third hardly; landmarks lie on what is interpolated between them."""
     sure, everywhere = np.full(SHAPE, 0.95, np.float32), np.ones(SHAPE, bool)

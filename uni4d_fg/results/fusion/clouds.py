@@ -16,6 +16,10 @@ from uni4d_fg.geometry.camera import camera_to_world, unproject
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 
 _POINTS_BETWEEN_MERGES = 2_000_000
+_SAMPLED = 4
+"""Of confidence, every this many pixels tell how much of it there is."""
+_TO_SPEAK_OF = 0.001
+"""Part of the pixels that are to be sure, so that only they are taken."""
 
 
 class Cloud(NamedTuple):
@@ -42,7 +46,8 @@ def static_cloud(
     """Build the cloud of everything that does not move, over the whole video.
 
     Pixels of moving instances, a band around them, and pixels at depth edges are left out, and so are those that are
-    not sure, as other frames see through them or past them. Points that share
+    not sure, as other frames see through them or past them: where next to none are sure in the whole video, as its
+    camera hardly moves, the less sure half of them. Points that share
     a voxel are averaged; merging goes on while frames are read, so that memory does not grow with the video.
 
     Args:
@@ -62,17 +67,28 @@ def static_cloud(
     parts: list[Cloud] = []
     waiting = 0
     cameras = np.broadcast_to(intrinsics, (len(images), 4))
-    for frame in range(0, len(images), config.static_frame_stride):
+    frames = range(0, len(images), config.static_frame_stride)
+    least = 0.0 if confidence is None else _least_confidence(confidence, frames, config.cloud_confidence)
+    for frame in frames:
         image, depth, mask = _maps(frame, images, depths, masks)
         keep = ~dilate(mask > 0, band_px) & ~depth_edges(depth, config.edge_relative_gradient)
         if confidence is not None:
-            keep &= confidence[frame] >= config.cloud_confidence
+            keep &= confidence[frame] >= least
         part = lift(image, depth, keep, cameras[frame], world_T_cam[frame], config.static_stride, lens)
         parts.append(part)
         waiting += len(part.points)
         if waiting > _POINTS_BETWEEN_MERGES and config.static_voxel_m > 0.0:
             parts, waiting = [merge_voxels(_concatenate(parts), config.static_voxel_m)], 0
     return merge_voxels(_concatenate(parts), config.static_voxel_m)
+
+
+def _least_confidence(confidence: FrameSource[Float32Array], frames: range, wanted: float) -> float:
+    """Return from which confidence on pixels are taken: the one that is wanted, if that leaves any to speak of."""
+    sampled = np.concatenate([confidence[frame][::_SAMPLED, ::_SAMPLED].ravel() for frame in frames])
+    known = sampled[sampled > 0]
+    if not len(known) or np.mean(known >= wanted) >= _TO_SPEAK_OF:
+        return wanted
+    return float(np.median(known))
 
 
 def dynamic_clouds(

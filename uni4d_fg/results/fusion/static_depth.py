@@ -183,7 +183,7 @@ def fuse_static(
         # The cue errs less where landmarks have corrected it, but frames are compared everywhere.
         usual = corrected.error.spread if np.isfinite(corrected.error.spread) else _UNCOMPARED_SIGMA
         error = _MEAN_TO_SIGMA * cue_error if np.isfinite(cue_error) else usual
-        sure = np.where(np.isfinite(corrected.log_depth), _within(np.float32(error)), np.float32(0))
+        sure = np.where(np.isfinite(corrected.log_depth), probability_right(np.float32(error)), np.float32(0))
         nothing = np.zeros_like(corrected.log_depth)
         return StaticDepth(corrected.log_depth, max(usual, _LANDMARK_SIGMA), sure, corrected, nothing)
     cue_sigma, cue_right = trust_in_cue(corrected.log_depth, measured, known)
@@ -219,7 +219,7 @@ def fuse_static(
     neither = (1 - p) * (1 - cue_right) * _normal(difference, np.full_like(difference, 2 * _WRONG_SIGMA**2))
     share = np.where(has_cue, chosen / (both + match_alone + cue_alone + neither), p)
     share[filled] = _FILLED_RIGHT
-    sure = share * _within(sigma)
+    sure = share * probability_right(sigma)
     return StaticDepth(
         log_depth.astype(np.float32),
         float(np.nanmedian(sigma)),
@@ -229,7 +229,7 @@ def fuse_static(
     )
 
 
-def _within(sigma: Float32Array | np.float32) -> Float32Array:
+def probability_right(sigma: Float32Array | np.float32) -> Float32Array:
     """Return the probability that log depth of this standard deviation is right to 3 %, of the same shape."""
     return np.asarray(erf(_RIGHT / (np.sqrt(2.0) * np.maximum(sigma, 1e-6))), dtype=np.float32)
 

@@ -39,6 +39,7 @@ recordings."""
 _PRIOR_SHARE = 0.8
 """Of what is told, in the logarithm, that such errors have; the rest is the landmarks'."""
 _MIN_COMPARED = 10
+_SIGMA_TO_MEAN = float(np.sqrt(2 / np.pi))
 
 
 def final_confidence(alone: Float32Array, averaged: Averaged, *, bleeds: bool = False) -> Float32Array:
@@ -93,8 +94,9 @@ class ToldError:
     """By the same: ``|log depth - log z|`` at landmarks."""
 
     def add(
-        self, log_depth: Float32Array, confidence: Float32Array, static: BoolArray, uv: FloatArray, log_z: FloatArray
-    ) -> None:
+        self, log_depth: Float32Array, confidence: Float32Array, static: BoolArray, uv: FloatArray, log_z: FloatArray,
+        *, common_sigma: float = 0.0,
+    ) -> None:  # fmt: skip
         """Add a frame.
 
         Args:
@@ -103,12 +105,14 @@ class ToldError:
             static: (h, w) what is counted.
             uv: (N, 2) landmarks, working px.
             log_z: (N,) their log depth.
+            common_sigma: Standard deviation of log depth that the frame shares with all others.
         """
         counted = static & np.isfinite(log_depth)
         sure = confidence[counted]
         above = [np.count_nonzero(sure >= np.float32(limit)) for limit in _BINS]
         self.pixels -= np.diff([len(sure), *above, 0])
-        self.expected += float(np.interp(sure, _SURENESS, _FROM_MOTION if self.from_motion else _ERRORS).sum())
+        of_its_own = np.interp(sure, _SURENESS, _FROM_MOTION if self.from_motion else _ERRORS)
+        self.expected += float(np.hypot(of_its_own, _SIGMA_TO_MEAN * common_sigma).sum())
         column, row = np.rint(uv).astype(np.int64).T
         inside = (column >= 0) & (row >= 0) & (column < static.shape[1]) & (row < static.shape[0])
         inside[inside] = counted[row[inside], column[inside]]
