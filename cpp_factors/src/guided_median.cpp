@@ -44,7 +44,8 @@ float middle_of(const float* values, const float* weights, int count) {
 }  // namespace
 
 void guided_median(const WeightedMap& map, const std::uint8_t* chosen, const MedianWindow& window, float* out) {
-  const auto most = static_cast<std::size_t>((2 * window.reach / window.step + 1) * (2 * window.reach / window.step + 1));
+  const int side = 2 * window.reach / window.step + 1;
+  const auto most = static_cast<std::size_t>(side * side);
   std::vector<float> values(most), weights(most), unlike(most), weighed(most);
   const float scale = 0.5F / (window.spatial * window.spatial);
   for (int y = 0; y < map.height; ++y)

@@ -14,9 +14,10 @@ struct MedianWindow {
   float steepest = 0.3F;  // a plane changes a value by at most this part on its way
 };
 
-/// A map (height, width) that is finite where its weight is above 0, slopes (height, width, 2): by what part it grows
-/// from a pixel to the one below and to the one on its right, and colors (height, width, 3) in units of sqrt(2) standard
-/// deviations of the weights by color.
+/// A map (height, width) that is finite where its weight is above 0.
+///
+/// Slopes (height, width, 2) say by what part it grows from a pixel to the one below and to the one on its right;
+/// colors (height, width, 3) are in units of sqrt(2) standard deviations of the weights by color.
 struct WeightedMap {
   const float* values = nullptr;
   const float* weights = nullptr;
