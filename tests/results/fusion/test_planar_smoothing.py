@@ -75,16 +75,6 @@ def test_an_edge_of_depth_and_image_stays_where_it_is() -> None:
     np.testing.assert_array_equal(out[:, 79:81], found[:, 79:81])
 
 
-def test_depth_that_is_wrong_as_a_whole_has_no_edges_to_keep() -> None:
-    """A part of a wall seems a quarter farther, as a pane does that reflects; nothing is sure of it."""
-    inverse = plane()
-    pane = np.zeros((HEIGHT, WIDTH), bool)
-    pane[40:80, 60:100] = True
-    found = np.where(pane, -np.log(inverse / 1.25), -np.log(inverse)).astype(np.float32)
-    out = smoothed_where_unsure(found, np.where(pane, 0.01, 0.95).astype(np.float32), gray())
-    assert error(out, inverse, pane) < 0.1 * error(found, inverse, pane)
-
-
 def test_what_is_far_is_not_carried_away_by_what_is_near() -> None:
     """A tenth of the inverse depth beside a near wall, unsure: its depth stays to 2 %, as absolute terms would not."""
     u = np.arange(WIDTH)[None, :].repeat(HEIGHT, axis=0)

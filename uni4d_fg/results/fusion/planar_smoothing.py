@@ -37,12 +37,12 @@ _CONTRAST = 0.05
 """Difference of colors, of 1, that halves the weight of a link between neighbors, and ..."""
 _STEP = 0.05
 """... the difference of log depth."""
-_LEAST_WEIGHT, _MISSING_WEIGHT = 1e-5, 1e-7
+_LEAST_WEIGHT, _MISSING_WEIGHT = 1e-4, 1e-7
 _NEAREST = 0.02
 """Least inverse depth, of the median one, that errors are relative to."""
 _UNSURE, _SURE = 0.3, 0.7
 """With less probability depth is replaced, with more it is kept, and mixed in between ..."""
-_EDGE, _WHOLE_EDGE = 0.3, 0.6
+_EDGE, _WHOLE_EDGE = 0.1, 0.2
 """... and so it is with the range of log depth around a pixel: edges are kept where they are."""
 _AROUND = np.ones((5, 5), np.uint8)
 
