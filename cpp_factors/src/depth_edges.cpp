@@ -26,7 +26,7 @@ constexpr float kAlike = 0.02F;                  // log depths that differ by le
 constexpr float kLike = 0.08F;                   // standard deviation of the weights by difference of gray values
 constexpr float kLargest = 0.15F;                // larger differences are all alike
 constexpr float kShown = 0.5F;                   // a view that shows less of a window says nothing of it
-constexpr float kBetter = 0.006F;                // another depth than a pixel's own is better by this at least
+constexpr float kBetter = 0.002F;                // another depth than a pixel's own is better by this at least
 
 /// The pixels around one: where they are, their gray values, and how much they count.
 struct Window {

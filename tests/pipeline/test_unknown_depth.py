@@ -28,10 +28,10 @@ def test_a_run_its_report_and_its_exports_say_it(tmp_path: Path, saw_parallax: b
     assert ("depth_error" in summary.stages["fusion"]) is saw_parallax
     assert ("static depth is off by some" in facts) is saw_parallax
     run = Run(tmp_path / "run", lambda: sequence)
-    if saw_parallax:  # as far off as pixels that are so sure
+    if saw_parallax:  # as far off as pixels that are so sure, and as landmarks whose rays tell no depth at all
         still = np.stack([mask == 0 for mask in sequence.masks])
         sure = np.load(run.folder.confidence)[still] / 255.0
-        usual = float(np.interp(sure, _SURENESS, _FROM_MOTION).mean())
+        usual = float(np.hypot(np.interp(sure, _SURENESS, _FROM_MOTION), np.sqrt(2 / np.pi)).mean())
         assert summary.stages["fusion"]["depth_error"] == pytest.approx(usual, rel=0.05)
     assert ("Nothing is known of depth" in str(certainty(run))) is not saw_parallax
     (exported,) = export_run(run, ["colmap"], tmp_path / "exported")

@@ -31,7 +31,7 @@ _LARGEST = np.float32(0.15)
 """Larger differences are all alike."""
 _SHOWN = np.float32(0.5)
 """A view that shows less than this part of a window says nothing of it, and a depth is tried where two views do."""
-_BETTER = np.float32(0.006)
+_BETTER = np.float32(0.002)
 """Another depth than a pixel's own is better by this at least."""
 
 
