@@ -14,7 +14,8 @@ FRAMES = 20
 
 def shares(points: FloatArray, step: FloatArray, noise_depth: float = 10.0) -> FloatArray:
     """Shares of landmarks (L, 3) that a camera sees which moves by ``step`` (3,) per frame."""
-    return landmark_shares(*seen_from(points, step, noise_depth))
+    labelled, scene, intrinsics = seen_from(points, step, noise_depth)
+    return landmark_shares(labelled, scene, variance_of_rays(labelled, scene, intrinsics))
 
 
 def seen_from(

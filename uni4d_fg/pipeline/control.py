@@ -42,7 +42,7 @@ def static_control(
         config: When a cue counts as broken.
     """
     variance = variance_of_rays(labelled, scene, intrinsics)
-    shares = landmark_shares(labelled, scene, intrinsics, variance)
+    shares = landmark_shares(labelled, scene, variance)
     track: IntArray = scene["landmark_track"]
     frames = []
     for frame, pose in enumerate(scene["world_T_cam"]):

@@ -21,9 +21,7 @@ _LARGEST = 1.0
 """Of the logarithm of depth that nothing tells."""
 
 
-def landmark_shares(
-    labelled: LabelledTracks, scene: Arrays, intrinsics: FloatArray, variance: FloatArray | None = None
-) -> FloatArray:
+def landmark_shares(labelled: LabelledTracks, scene: Arrays, variance: FloatArray) -> FloatArray:
     """Return what part of its weight each landmark (L,) has, 0 to 1, by how sure its depth is beside that of others.
 
     Where the camera shows parallax of some landmarks only, those of the others follow the noise of their tracks. Where
@@ -32,13 +30,10 @@ def landmark_shares(
     Args:
         labelled: Observations.
         scene: Record of stage 2.
-        intrinsics: (T, 4) px.
-        variance: (L,) :func:`variance_of_rays`, if it is known.
+        variance: (L,) :func:`variance_of_rays`.
     """
-    if not len(scene["landmarks"]):
+    if not len(variance):
         return np.zeros(0)
-    if variance is None:
-        variance = variance_of_rays(labelled, scene, intrinsics)
     # Landmarks also know what the cue says in all of their frames.
     seen = np.count_nonzero(labelled.weight[scene["landmark_track"]] > 0, axis=1)
     of_cue = seen / max(StaticNoise.of_array(scene["noise"]).depth_sigma, 1e-6) ** 2
@@ -71,9 +66,9 @@ def variance_of_rays(labelled: LabelledTracks, scene: Arrays, intrinsics: FloatA
     """
     points: FloatArray = scene["landmarks"]
     poses: FloatArray = scene["world_T_cam"]
-    weight = labelled.weight[scene["landmark_track"]] > 0
     if not len(points):
         return np.zeros(0)
+    weight = labelled.weight[scene["landmark_track"]] > 0
     information = np.zeros((len(points), 3, 3))
     for frame, pose in enumerate(poses):
         seen = np.flatnonzero(weight[:, frame])

@@ -215,6 +215,7 @@ class _Validation:
         empty: list[int] = []
         odd: list[int] = []
         usable: list[int] = []
+        in_meters = self.metric or item != "depth"
 
         def visit(frame: int, depth: npt.NDArray[np.float32]) -> None:
             known = depth[np.isfinite(depth)]
@@ -225,7 +226,6 @@ class _Validation:
                 empty.append(frame)
                 return
             medians.append(float(np.median(known)))
-            in_meters = self.metric or item != "depth"
             if in_meters and not PLAUSIBLE_DEPTH[0] <= medians[-1] <= PLAUSIBLE_DEPTH[1]:
                 odd.append(frame)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, evenly_spread
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import InputError
 from uni4d_fg.frontend.sequence.model import FrameSource
@@ -16,8 +16,8 @@ from uni4d_fg.geometry.camera import camera_to_world, unproject
 from uni4d_fg.geometry.lens import PINHOLE, Lens
 
 _POINTS_BETWEEN_MERGES = 2_000_000
-_SAMPLED = 4
-"""Of confidence, every this many pixels tell how much of it there is."""
+_SAMPLED, _SAMPLED_FRAMES = 4, 24
+"""Of confidence, every this many pixels of at most so many frames tell how much of it there is."""
 _TO_SPEAK_OF = 0.001
 """Part of the pixels that are to be sure, so that only they are taken."""
 
@@ -84,7 +84,8 @@ def static_cloud(
 
 def _least_confidence(confidence: FrameSource[Float32Array], frames: range, wanted: float) -> float:
     """Return from which confidence on pixels are taken: the one that is wanted, if that leaves any to speak of."""
-    sampled = np.concatenate([confidence[frame][::_SAMPLED, ::_SAMPLED].ravel() for frame in frames])
+    some = [frames[place] for place in evenly_spread(len(frames), _SAMPLED_FRAMES).tolist()]
+    sampled = np.concatenate([confidence[frame][::_SAMPLED, ::_SAMPLED].ravel() for frame in some])
     known = sampled[sampled > 0]
     if not len(known) or np.mean(known >= wanted) >= _TO_SPEAK_OF:
         return wanted

@@ -55,7 +55,7 @@ def guided_median(
     colors = small.astype(np.float32) / np.float32(255 * np.sqrt(2.0) * _COLOR)
     weights = np.where(known, confidence + _LEAST, np.float32(0)).astype(np.float32)
     inverse = np.exp(-np.where(known, log_depth, np.float32(0))).astype(np.float32)
-    slopes = slopes_of(inverse, weights)
+    slopes = _slopes(inverse, weights)
     core, _ = find_extension()
     if core is None:
         found = guided_median_numpy(inverse, weights, slopes, colors, chosen)
@@ -67,7 +67,7 @@ def guided_median(
     return np.where(chosen, -np.log(found), log_depth)
 
 
-def slopes_of(inverse: Float32Array, weights: Float32Array) -> Float32Array:
+def _slopes(inverse: Float32Array, weights: Float32Array) -> Float32Array:
     """Return by what part inverse depth grows from a pixel to the one below and to the one on its right, (h, w, 2).
 
     Args:
