@@ -17,6 +17,7 @@ from uni4d_fg.cues.structure.judging import HeldOut, held_out
 from uni4d_fg.cues.structure.selection import mean_pixels, spread_tracks
 from uni4d_fg.cues.structure.self_calibration import FocalGuess
 from uni4d_fg.errors import Cancelled, SolverError
+from uni4d_fg.optim.threads import map_in_order, thread_count
 from uni4d_fg.progress import SilentReporter
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -107,15 +108,14 @@ class Competition:
         if self.outlier.mean() >= _MUCH:
             starts += [(pair, "minority") for pair in self.pairs("minority")[:1]]
         first, *factors = self.factors()
-        found = [one for pair, part in starts if (one := self.trial(pair, first, part)) is not None]
+        found = self.trials([(pair, first, part) for pair, part in starts])
         if sum(one.tracks == "majority" for one in found) < _MOST_FAIL * len(chosen):
             sturdy = [pair for pair in distinct(in_common(pairs), settings.tried_pairs) if pair not in chosen]
-            found += [one for pair in sturdy if (one := self.trial(pair, first, "majority")) is not None]
+            found += self.trials([(pair, first, "majority") for pair in sturdy])
         found = ranked(found)
         if found and self.free_focal:
             best = found[0]
-            tried = [self.trial(best.pair, factor, best.tracks) for factor in factors]
-            found = ranked(found + [hypothesis for hypothesis in tried if hypothesis is not None])
+            found = ranked(found + self.trials([(best.pair, factor, best.tracks) for factor in factors]))
         return found
 
     def at_sides(self) -> Hypothesis | None:
@@ -154,6 +154,11 @@ class Competition:
             return []
         ranked = rank_pairs(seen, self.num_frames, self.intrinsics, settings, known_focal=not self.free_focal)
         return [pair for pair in ranked if has_parallax(pair, settings)]
+
+    def trials(self, starts: list[tuple[FramePair, float, Part]]) -> list[Hypothesis]:
+        """Return what starts give a scene, side by side, in their order. Raises Cancelled."""
+        found = map_in_order(lambda start: self.trial(*start), starts, thread_count())
+        return [one for one in found if one is not None]
 
     def trial(self, pair: FramePair, factor: float, part: Part) -> Hypothesis | None:
         """Start from a pair, add frames around it, and judge; None if the pair gives no points."""

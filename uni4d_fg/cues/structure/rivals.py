@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from uni4d_fg.arrays import FloatArray, IntArray
 from uni4d_fg.cues.structure.hypotheses import Hypothesis
 from uni4d_fg.errors import SolverError
+from uni4d_fg.optim.threads import map_in_order, thread_count
 
 NEARLY_AS_WELL = 0.02
 """A rival leaves at most this much more unexplained."""
@@ -44,20 +45,21 @@ def rivals_of(hypotheses: list[Hypothesis], world_T_cam: FloatArray) -> list[Riv
     Raises:
         Cancelled: If asked to stop.
     """
-    found = []
-    for hypothesis in hypotheses:
+
+    def refined(hypothesis: Hypothesis) -> Rival | None:
         frames = np.flatnonzero(hypothesis.scene.registered)
         if hypothesis.misfit > hypotheses[0].misfit + NEARLY_AS_WELL or len(frames) < _LEAST_COMMON:
-            continue
+            return None
         try:
             hypothesis.scene.measure_noise()
             hypothesis.scene.converge()
         except SolverError:
-            continue
+            return None
         degrees, turns = rotation_difference(hypothesis.scene.world_T_cam, world_T_cam, frames)
         pair, focal = hypothesis.pair, hypothesis.scene.mean_focal
-        found.append(Rival(pair.first, pair.second, focal, hypothesis.unexplained, degrees, turns))
-    return found
+        return Rival(pair.first, pair.second, focal, hypothesis.unexplained, degrees, turns)
+
+    return [rival for rival in map_in_order(refined, hypotheses, thread_count()) if rival is not None]
 
 
 def rotation_difference(a: FloatArray, b: FloatArray, frames: IntArray) -> tuple[float, float]:
