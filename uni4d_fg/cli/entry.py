@@ -10,6 +10,9 @@ from types import FrameType
 
 from uni4d_fg.allocation import keep_freed_memory
 
+_IDLE_THREADS = {"OPENCV_THREAD_POOL_ACTIVE_WAIT_MAIN": "0", "OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER": "0"}
+"""OpenCV's threads wait for each other in loops, which took a twentieth of all processor time from those that work."""
+
 
 def _end(number: int, frame: FrameType | None) -> None:
     """End the process at once: an exception would get lost in the libraries that are being loaded."""
@@ -28,6 +31,8 @@ def main() -> None:
         if with_escapes is not None:
             with_escapes(errors="backslashreplace")
     keep_freed_memory()
+    for variable, value in _IDLE_THREADS.items():
+        os.environ.setdefault(variable, value)
     from uni4d_fg.cli.main import main as run
 
     try:
