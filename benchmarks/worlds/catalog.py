@@ -1,0 +1,17 @@
+"""All worlds by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from benchmarks.worlds import crowds, outdoors, rooms, stages, streets
+from benchmarks.worlds.film import World
+
+WORLDS: dict[str, Callable[[], World]] = {
+    make.__name__: make
+    for make in (
+        streets.street_walk, streets.dash, rooms.table_orbit, rooms.living_room, outdoors.park_dog, outdoors.drone,
+        stages.dancers, crowds.stairs_portrait, stages.skate, crowds.market,
+    )
+}  # fmt: skip
+"""Functions that build them."""
