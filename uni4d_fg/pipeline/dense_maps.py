@@ -35,7 +35,7 @@ from uni4d_fg.results.fusion.static_depth import (
     probability_right,
     without_edges,
 )
-from uni4d_fg.results.fusion.told_error import final_confidence
+from uni4d_fg.results.fusion.told_error import final_confidence, without_texture
 from uni4d_fg.results.fusion.upsampling import upsample_guided
 from uni4d_fg.slam.stages.scene import StaticNoise
 
@@ -249,6 +249,9 @@ class DenseMaps:
             full = lifted(filled, self.size.continued(mine.log_cue), given, self.size)
         if (moving > 0).any():
             full[moving > 0] = np.exp(self._moving(frame, given, moving)[moving > 0])
+        if self.is_interpolated and frame in self.matched:
+            gray = self.size.shown(self.multiview.gray(frame))
+            sure = without_texture(sure, gray, self.config.multiview.window_radius_px)
         return full, FinalStatic(log_depth, sure, self.size.shown(unmasked))
 
     def common_sigma(self, frame: int) -> float:

@@ -116,6 +116,10 @@ class MultiviewDepth:
         again = edges_again(inverse, own, chosen, others, transfers, self.threads)
         return np.where(again == inverse, log_depth, -np.log(again))
 
+    def gray(self, frame: int) -> Float32Array:
+        """Return the gray values (h, w) of a frame, of 1."""
+        return self._shown(frame).gray
+
     def forget_before(self, frame: int, finished: int) -> None:
         """Forget what is not needed any more.
 
