@@ -7,6 +7,7 @@ import pytest
 from cues.start_scenes import GUESS, SIZE, K, TrackedScene, camera_path, forward, sideways, tracked
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure import hypotheses
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
 from uni4d_fg.cues.structure.first_pair import FramePair
 from uni4d_fg.cues.structure.growing import GrowingScene
@@ -67,9 +68,25 @@ def test_a_bad_pair_loses_and_an_unusual_focal_length_too(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(competition, "pairs", lambda _: pairs)
     monkeypatch.setattr(competition, "trial", trial)
+    monkeypatch.setattr(hypotheses, "thread_count", lambda: 1)  # so that they are tried in their order
     assert [h.pair for h in competition.run()] == [pairs[1], pairs[1], pairs[1], pairs[2], pairs[0]]
     # Other focal lengths are tried from the best pair.
     assert tried[3:] == [(pairs[1], 0.75), (pairs[1], 1.4)]
+
+
+def test_trials_side_by_side_end_as_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracks = tracked(sideways(FRAMES), 4, points=80)
+    found = []
+    for count in (1, 3):
+        monkeypatch.setattr(hypotheses, "thread_count", lambda count=count: count)
+        found.append(competition_of(tracks).run())
+    alone, together = found
+    assert len(alone) > 2
+    assert [one.pair for one in alone] == [one.pair for one in together]
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.scene.world_T_cam, other.scene.world_T_cam)
+        np.testing.assert_array_equal(one.scene.position, other.scene.position)
+        assert one.misfit == other.misfit
 
 
 @pytest.mark.parametrize("enough", [100, 15])
@@ -88,6 +105,7 @@ def test_where_wide_pairs_fail_those_with_the_most_common_tracks_are_tried(
 
     monkeypatch.setattr(competition, "pairs", lambda _: [*wide, *near])
     monkeypatch.setattr(competition, "trial", trial)
+    monkeypatch.setattr(hypotheses, "thread_count", lambda: 1)  # so that they are tried in their order
     assert competition.run()[0].pair == (near if enough == 100 else wide)[0]
     count = CONFIG.geometric_depth.tried_pairs
     expected = [*wide[:count], *near[:count]] if enough == 100 else wide[:count]
