@@ -16,6 +16,7 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+from h264 import decoded, encode
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
@@ -37,19 +38,10 @@ COARSE = ["grid_columns=16", "grid_rows=16", "query_interval=20", "reseed_spacin
 
 def compressed(images: np.ndarray, kbps: int) -> np.ndarray:
     """Return images (T, H, W, 3) as they come out of an H.264 file of a bit rate."""
-    import av
-
     file = io.BytesIO()
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=RATE)
-        stream.height, stream.width = images.shape[1:3]
-        stream.pix_fmt, stream.bit_rate = "yuv420p", 1000 * kbps
-        for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
-        container.mux(stream.encode())
+    encode(images, file, RATE, kbps)
     file.seek(0)
-    with av.open(file) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+    return decoded(file)
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 
+from benchmarks.h264 import decoded, encode
 from benchmarks.worlds.catalog import WORLDS
-from benchmarks.worlds.film import Filming, World, encode
+from benchmarks.worlds.film import Filming, World
 from benchmarks.worlds.truth import FrameTruth, frame_truth, save, warp_difference
 from uni4d_fg.arrays import ImageArray
-
-
-def decoded(path: Path) -> ImageArray:
-    """Return the frames (T, H, W, 3) of a video."""
-    with av.open(str(path)) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
 def render(world: World, out: Path, frames: int) -> None:
@@ -35,7 +29,8 @@ def render(world: World, out: Path, frames: int) -> None:
             truths.append(frame_truth(filming, frame))
             yield filming.image(frame)
 
-    encode(images(), out / f"{world.name}.mp4", world.fps, world.kbps)
+    out.mkdir(parents=True, exist_ok=True)
+    encode(images(), out / f"{world.name}.mp4", world.fps, world.kbps, threads=1)
     spent = (time.perf_counter() - built) / frames
     save(out / "gt" / f"{world.name}.npz", filming, truths)
     share = np.mean([truth.moving.mean() for truth in truths])

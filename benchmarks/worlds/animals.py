@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.worlds.people import Path, bent
+from benchmarks.worlds.people import Path, bent, heading
 from benchmarks.worlds.stage import Thing
 from benchmarks.worlds.surface import Material, Piece, along, ball, frame_of, limb, turn_y
 from benchmarks.worlds.textures import plain
@@ -58,8 +58,7 @@ def four_legged(
 
     def poses(time: float) -> FloatArray:
         s = speed * (time + start_s)
-        ahead = path(s + 0.05) - path(s - 0.05)
-        turn = turn_y(float(np.arctan2(ahead[0], ahead[2])))
+        turn = turn_y(heading(path, s))
         right, _, front = turn.T
         cycle = s / stride
         bound = 0.1 * h * np.sin(2 * np.pi * cycle) if gallop else 0.015 * h * np.sin(4 * np.pi * cycle)

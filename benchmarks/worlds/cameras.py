@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.worlds.surface import Vector, frame_of
+from benchmarks.worlds.surface import Vector
 from uni4d_fg.arrays import FloatArray
+from uni4d_fg.frontend.synthetic.camera_path import look_at
 from uni4d_fg.geometry.se3 import so3_exp
 
 Camera = Callable[[float], FloatArray]
@@ -17,11 +18,9 @@ Camera = Callable[[float], FloatArray]
 
 def looking(position: FloatArray | Vector, target: FloatArray | Vector) -> FloatArray:
     """Return world_T_cam (4, 4) of an upright camera at a position that looks at a target, meters."""
-    z = np.asarray(target, dtype=np.float64) - np.asarray(position, dtype=np.float64)
-    z /= np.linalg.norm(z)
-    x = np.cross(np.array([0.0, 1.0, 0.0]), z)
-    x /= np.linalg.norm(x)
-    return frame_of(position, np.stack((x, np.cross(z, x), z), axis=-1))
+    eye, point = (np.asarray(place, dtype=np.float64)[None] for place in (position, target))
+    pose: FloatArray = look_at(eye, point, np.zeros(1))[0]
+    return pose
 
 
 def wander(

@@ -1,11 +1,8 @@
-"""Frames of a world: several times within each exposure, then the sensor, then H.264."""
+"""Frames of a world: several times within each exposure, then the sensor."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 
@@ -125,20 +122,3 @@ class Filming:
         shown = _CURVE[np.clip(light * 4095, 0, 4095).astype(np.int32)]
         shown += world.noise * np.sqrt(0.4 + shown) * rng.standard_normal(shown.shape)
         return np.asarray(np.round(255.0 * np.clip(shown, 0.0, 1.0)), dtype=np.uint8)
-
-
-def encode(images: Iterable[ImageArray], path: Path, fps: float, kbps: int) -> None:
-    """Write images (H, W, 3) as H.264 of a bit rate in kbit/s."""
-    import av
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = None
-        for image in images:
-            if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-                stream.height, stream.width = image.shape[:2]
-                stream.pix_fmt, stream.bit_rate, stream.thread_count = "yuv420p", 1000 * kbps, 1
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
-        if stream is not None:
-            container.mux(stream.encode())

@@ -11,10 +11,10 @@ from benchmarks.worlds.people import look, straight, walker
 from benchmarks.worlds.props import bench, bush, tree
 from benchmarks.worlds.shading import Light
 from benchmarks.worlds.stage import Thing
-from benchmarks.worlds.streets import asphalt
-from benchmarks.worlds.surface import Material, Piece, ball, extruded, frame_of, pole, slab
+from benchmarks.worlds.streets import asphalt, white_lines
+from benchmarks.worlds.surface import Material, Piece, ball, extruded, frame_of, pole, slab, turn_x
 from benchmarks.worlds.textures import bricks, cloth, grass, pebbles, plain, scaled, spots
-from benchmarks.worlds.vehicles import driving, parked
+from benchmarks.worlds.vehicles import PAINTS, driving, parked
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.geometry.se3 import so3_exp
 
@@ -97,11 +97,8 @@ def _house(place: tuple[float, float], size: tuple[float, float, float], yaw: fl
         ]
         if rng.random() < 0.5:
             # A window in the roof lies on its slope.
-            tilt = np.arctan2(rise, 0.5 * deep)
-            c, s = np.cos(tilt), np.sin(tilt)
-            frame = np.eye(4)
-            frame[:3, :3] = [[1, 0, 0], [0, c, -s], [0, s, c]]
-            frame[:3, 3] = (x, -tall - 0.5 * rise - 0.08, -0.25 * deep)
+            slope = turn_x(-np.arctan2(rise, 0.5 * deep))
+            frame = frame_of((x, -tall - 0.5 * rise - 0.08, -0.25 * deep), slope)
             pieces.append(slab((0.9, 0.12, 1.2), (0, 0, 0), dark).placed(frame))
     return [piece.moved((place[0], 0.0, place[1]), yaw) for piece in pieces]
 
@@ -120,20 +117,12 @@ def drone() -> World:
         slab((9.5, 0.2, 400.0), (3.0, 0.085, 80.0), walkway),
         slab((6.5, 0.2, 400.0), (3.0, 0.07, 80.0), asphalt()),
     ]
-    white = Material(spots((0.62, 0.62, 0.6), (0.88, 0.88, 0.86), 62, 16), 1.5)
+    white = white_lines()
     for z in (8.0, 52.0, 96.0):
         static += [
             slab((2.2, 0.02, 0.14), (-60.0 + 5.5 * i, -0.025, z), white) for i in range(24) if abs(-63.0 + 5.5 * i) > 4
         ]
     static += [slab((0.14, 0.02, 2.2), (3.0, -0.035, -10 + 5.5 * i), white) for i in range(26)]
-    colors = [
-        (0.5, 0.06, 0.06),
-        (0.12, 0.2, 0.4),
-        (0.75, 0.75, 0.76),
-        (0.1, 0.11, 0.12),
-        (0.25, 0.36, 0.28),
-        (0.6, 0.55, 0.45),
-    ]
     number = 0
     for row, z in enumerate((-4.0, 20.0, 40.0, 64.0, 84.0, 108.0, 128.0)):
         for x in (-52.0, -37.0, -22.0, -9.0, 15.5, 30.0, 45.0, 60.0):
@@ -148,12 +137,12 @@ def drone() -> World:
                     (x + rng.uniform(-4, 4), back), rng.uniform(4, 6.5), rng.uniform(1.3, 1.9), 800 + number, 900, 0.2
                 )
             if rng.random() < 0.4:
-                static += parked(colors[number % 6], (x + 5.6, z - 1.0), 0.0, number)
+                static += parked(PAINTS[number % 6], (x + 5.6, z - 1.0), 0.0, number)
     things = [
-        driving(colors[0], straight((-38.0, 50.4), (60.0, 50.4)), lambda t: 9.0 * t, 1),
-        driving(colors[2], straight((30.0, 53.6), (-60.0, 53.6)), lambda t: 8.0 * t, 2),
-        driving(colors[1], straight((1.4, 75.0), (1.4, 0.0)), lambda t: 7.0 * t, 3, 4.9),
-        driving(colors[5], straight((4.6, 18.0), (4.6, 160.0)), lambda t: 8.0 * t, 4),
+        driving(PAINTS[0], straight((-38.0, 50.4), (60.0, 50.4)), lambda t: 9.0 * t, 1),
+        driving(PAINTS[2], straight((30.0, 53.6), (-60.0, 53.6)), lambda t: 8.0 * t, 2),
+        driving(PAINTS[1], straight((1.4, 75.0), (1.4, 0.0)), lambda t: 7.0 * t, 3, 4.9),
+        driving(PAINTS[5], straight((4.6, 18.0), (4.6, 160.0)), lambda t: 8.0 * t, 4),
     ]
 
     def path(time: float) -> FloatArray:

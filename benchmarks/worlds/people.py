@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.worlds.cameras import smooth, wander
 from benchmarks.worlds.stage import Thing
-from benchmarks.worlds.surface import Material, Piece, along, ball, frame_of, limb, slab, turn_y
+from benchmarks.worlds.surface import Material, Piece, along, ball, frame_of, limb, slab, turn_x, turn_y
 from benchmarks.worlds.textures import Color, cloth, plain, random_color, scaled, spots
 from uni4d_fg.arrays import FloatArray
 
@@ -147,8 +147,7 @@ def posed(pose: Pose) -> FloatArray:
         ankle = pose.feet[i] + [0.0, -k * _ANKLE, 0.0]
         knee, ankle = bent(hip, ankle, k * _THIGH, k * _SHIN, front + 0.08 * side * right)
         frames[10 + i], frames[12 + i] = along(hip, knee, front), along(knee, ankle, front)
-        c, s = np.cos(pose.pitch[i]), np.sin(pose.pitch[i])
-        frames[14 + i] = frame_of(ankle, turn @ np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]))
+        frames[14 + i] = frame_of(ankle, turn @ turn_x(pose.pitch[i]))
     frames[:, :3, :3] *= k
     return frames
 
@@ -158,6 +157,12 @@ def straight(start: tuple[float, float], end: tuple[float, float]) -> Path:
     a, b = np.array([start[0], 0.0, start[1]]), np.array([end[0], 0.0, end[1]])
     unit = (b - a) / np.linalg.norm(b - a)
     return lambda s: a + s * unit
+
+
+def heading(path: Path, s: float, reach: float = 0.05) -> float:
+    """Return the yaw, rad, of a path between ``reach`` meters before and after a place on it."""
+    ahead = path(s + reach) - path(s - reach)
+    return float(np.arctan2(ahead[0], ahead[2]))
 
 
 def flat(x: float, z: float) -> float:
@@ -185,8 +190,7 @@ def walker(
 
     def poses(time: float) -> FloatArray:
         s = speed * (time + start_s)
-        ahead = path(s + 0.05) - path(s - 0.05)
-        yaw = float(np.arctan2(ahead[0], ahead[2]))
+        yaw = heading(path, s)
         right = turn_y(yaw)[:, 0]
         feet, pitch = np.empty((2, 3)), [0.0, 0.0]
         for i, side in enumerate((-1.0, 1.0)):

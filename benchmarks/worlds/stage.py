@@ -120,28 +120,24 @@ class Stage:
         self._moving_triangles = (triangles[self.static_triangles :] - fixed).astype(np.int32)
         self._rest_normals = [[normals_of(p.vertices, p.triangles) for p in thing.pieces] for thing in things]
 
-    def bodies(self, time: float) -> list[FloatArray]:
-        """Return the vertices (n, 3) of each thing at a time in seconds, meters."""
-        result = []
-        for thing in self.things:
-            poses = thing.poses(time)
-            result.append(
-                np.concatenate(
-                    [
-                        p.vertices @ poses[f, :3, :3].T + poses[f, :3, 3]
-                        for p, f in zip(thing.pieces, thing.frame, strict=False)
-                    ]
-                )
-            )
-        return result
+    def poses(self, time: float) -> list[FloatArray]:
+        """Return the (P, 4, 4) frames of each thing at a time in seconds."""
+        return [thing.poses(time) for thing in self.things]
+
+    def bodies(self, poses: list[FloatArray]) -> list[FloatArray]:
+        """Return the vertices (n, 3) of each thing, meters, by the frames that :meth:`poses` returns."""
+        return [
+            np.concatenate([piece.placed(own[f]).vertices for piece, f in zip(thing.pieces, thing.frame, strict=True)])
+            for thing, own in zip(self.things, poses, strict=True)
+        ]
 
     def at(self, time: float) -> Moment:
         """Return the world at a time in seconds."""
+        poses = self.poses(time)
         normals = []
-        for thing, rest in zip(self.things, self._rest_normals, strict=True):
-            poses = thing.poses(time)
-            normals += [n @ poses[f, :3, :3].T for n, f in zip(rest, thing.frame, strict=True)]
-        bodies = self.bodies(time)
+        for thing, rest, own in zip(self.things, self._rest_normals, poses, strict=True):
+            normals += [n @ own[f, :3, :3].T for n, f in zip(rest, thing.frame, strict=True)]
+        bodies = self.bodies(poses)
         if not bodies:
             return Moment(self._static_normals, Caster(np.zeros((0, 3), np.float32), self._moving_triangles), [])
         corners = np.concatenate(normals)[self._moving_triangles].astype(np.float32)
@@ -171,6 +167,6 @@ class Stage:
 
     def moves(self, time: float, step_s: float = 0.02) -> BoolArray:
         """Return (1 + things,) whether each instance moves around a time in seconds; static is False."""
-        pairs = zip(self.bodies(time - step_s), self.bodies(time + step_s), strict=True)
-        fastest = [np.linalg.norm(b - a, axis=-1).max() / (2 * step_s) for a, b in pairs]
+        before, after = (self.bodies(self.poses(time + step)) for step in (-step_s, step_s))
+        fastest = [np.linalg.norm(b - a, axis=-1).max() / (2 * step_s) for a, b in zip(before, after, strict=True)]
         return np.array([False, *(speed > MOVING_M_PER_S for speed in fastest)])

@@ -11,7 +11,7 @@ from benchmarks.worlds.props import bush, facade, lamp_post, tree
 from benchmarks.worlds.shading import Light
 from benchmarks.worlds.surface import Material, Piece, extruded, pole, slab
 from benchmarks.worlds.textures import bricks, grass, pebbles, plain, random_color, spots
-from benchmarks.worlds.vehicles import driving, parked
+from benchmarks.worlds.vehicles import PAINTS, driving, parked
 from uni4d_fg.arrays import FloatArray
 
 
@@ -20,7 +20,7 @@ def asphalt() -> Material:
     return Material(spots((0.2, 0.2, 0.21), (0.44, 0.44, 0.44), 61, 16, 0.95, 0.2), 3.0, macro=0.06)
 
 
-def _white() -> Material:
+def white_lines() -> Material:
     """Return the paint of lines on roads."""
     return Material(spots((0.62, 0.62, 0.6), (0.88, 0.88, 0.86), 62, 16), 1.5)
 
@@ -41,7 +41,7 @@ def street_walk() -> World:
         slab((12.0, 0.2, 130.0), (15.2, 0.1, 40.0), Material(paving, 2.4, macro=0.05)),
         slab((60.0, 20.0, 1.0), (5.0, -8.0, 103.0), yellow),
     ]
-    static += [slab((0.12, 0.01, 2.0), (5.4, 0.12, 1.0 + 5 * i), _white()) for i in range(20)]
+    static += [slab((0.12, 0.01, 2.0), (5.4, 0.12, 1.0 + 5 * i), white_lines()) for i in range(20)]
     # Houses of different widths; those at the far end are as tall as the street is long.
     left = [(-14, -3, 3, plaster), (-3, 5.5, 3, red), (5.5, 13, 4, plaster), (13, 22, 3, yellow), (22, 34, 4, red),
             (34, 48, 3, blue), (48, 66, 4, yellow), (66, 100, 3, red)]  # fmt: skip
@@ -51,20 +51,12 @@ def street_walk() -> World:
         static += facade(-2.3, start, end, floors, wall, 100 + i)
     for i, (start, end, floors, wall) in enumerate(right):
         static += facade(12.2, start, end, floors, wall, 200 + i, -1.0)
-    colors = [
-        (0.5, 0.06, 0.06),
-        (0.12, 0.2, 0.4),
-        (0.75, 0.75, 0.76),
-        (0.1, 0.11, 0.12),
-        (0.25, 0.36, 0.28),
-        (0.6, 0.55, 0.45),
-    ]
     for i, z in enumerate((3.2, 9.0, 14.4, 21.5, 27.0, 33.0, 44.0)):
         static += [
-            p.moved((0, 0.12, 0)) for p in parked(colors[i % 6], (2.75, z), 0.02 * (-1) ** i, i, 4.9 if i == 3 else 4.2)
+            p.moved((0, 0.12, 0)) for p in parked(PAINTS[i % 6], (2.75, z), 0.02 * (-1) ** i, i, 4.9 if i == 3 else 4.2)
         ]
     for i, z in enumerate((1.0, 7.5, 13.0, 24.0, 31.0, 40.0)):
-        static += [p.moved((0, 0.12, 0)) for p in parked(colors[(i + 2) % 6], (8.0, z), np.pi, 10 + i)]
+        static += [p.moved((0, 0.12, 0)) for p in parked(PAINTS[(i + 2) % 6], (8.0, z), np.pi, 10 + i)]
     for z in (6.4, 18.0, 30.0, 42.0):
         static += lamp_post((1.3, z), 4.4, 0.8)
     static += tree((1.1, 12.0), 5.2, 1.5, 5, 2600, 0.08) + tree((1.1, 25.0), 5.6, 1.6, 6, 2600, 0.08)
@@ -101,8 +93,8 @@ def dash() -> World:
         slab((11.0, 0.2, 500.0), (0.0, 0.13, 200.0), gravel),
         slab((7.6, 0.2, 500.0), (0.0, 0.1, 200.0), asphalt()),
     ]
-    static += [slab((0.13, 0.02, 500.0), (x, 0.002, 200.0), _white()) for x in (-3.55, 3.55)]
-    static += [slab((0.13, 0.02, 3.0), (0.0, 0.002, 4.0 + 7.5 * i), _white()) for i in range(50)]
+    static += [slab((0.13, 0.02, 500.0), (x, 0.002, 200.0), white_lines()) for x in (-3.55, 3.55)]
+    static += [slab((0.13, 0.02, 3.0), (0.0, 0.002, 4.0 + 7.5 * i), white_lines()) for i in range(50)]
     for x in (4.9, -4.9):
         static += [slab((0.03, 0.12, 400.0), (x, y, 180.0), zinc) for y in (-0.55, -0.72)]
         static += [slab((0.05, 0.08, 400.0), (x + 0.02 * np.sign(x), -0.635, 180.0), zinc)]

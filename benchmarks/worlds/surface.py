@@ -60,6 +60,12 @@ def turn_y(yaw: float) -> FloatArray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
+def turn_x(pitch: float) -> FloatArray:
+    """Return the (3, 3) rotation about x, which takes z towards y by ``pitch`` rad."""
+    c, s = np.cos(pitch), np.sin(pitch)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
+
+
 def frame_of(position: Point, rotation: FloatArray | None = None) -> FloatArray:
     """Return the (4, 4) transform of a position, meters, and a rotation (3, 3)."""
     result = np.eye(4)

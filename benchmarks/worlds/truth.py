@@ -27,6 +27,8 @@ class FrameTruth:
     """(H, W) True on things that move around this time."""
     instance: ImageArray
     """(H, W) number of the moving thing, 0 on what stands still."""
+    moves: BoolArray
+    """(1 + things,) True for those that move around this time."""
 
 
 def _rounded(depth: Float32Array) -> Float32Array:
@@ -46,15 +48,14 @@ def frame_truth(filming: Filming, frame: int) -> FrameTruth:
     met = meet.triangle >= 0
     depth = _rounded(np.where(met, meet.distance, 0.0).astype(np.float32)).reshape(shape)
     instance = np.where(met, stage.instance[np.maximum(meet.triangle, 0)], 0).astype(np.uint8).reshape(shape)
-    return FrameTruth(pose, depth, stage.moves(time)[instance], instance)
+    moves = stage.moves(time)
+    return FrameTruth(pose, depth, moves[instance], instance, moves)
 
 
 def save(path: Path, filming: Filming, frames: list[FrameTruth]) -> None:
     """Write world_T_cam (T, 4, 4), K (4,), fps, depth, moving and instance (T, H, W) as one .npz."""
     world = filming.world
-    ever = np.zeros(len(world.things) + 1, dtype=bool)
-    for t in range(len(frames)):
-        ever |= filming.stage.moves(world.time(t))
+    ever = np.any([frame.moves for frame in frames], axis=0)
     instance = np.stack([frame.instance for frame in frames])
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(

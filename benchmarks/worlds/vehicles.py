@@ -6,12 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.worlds.people import Path
+from benchmarks.worlds.people import Path, heading
 from benchmarks.worlds.stage import Thing
-from benchmarks.worlds.surface import Material, Piece, extruded, frame_of, lathe, slab, turn_y
+from benchmarks.worlds.surface import Material, Piece, extruded, frame_of, lathe, slab, turn_x, turn_y
 from benchmarks.worlds.textures import Color, bricks, plain, spots
 from uni4d_fg.arrays import FloatArray
 
+PAINTS: tuple[Color, ...] = (
+    (0.5, 0.06, 0.06), (0.12, 0.2, 0.4), (0.75, 0.75, 0.76), (0.1, 0.11, 0.12), (0.25, 0.36, 0.28), (0.6, 0.55, 0.45)
+)  # fmt: skip
+"""Of cars."""
 WHEEL_M = 0.32
 """Radius of a car's wheels."""
 
@@ -26,9 +30,8 @@ def _wheel(radius: float, width: float) -> list[Piece]:
     tip = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     pieces = [tyre.placed(frame_of((0, 0, 0), tip))]
     for i in range(5):
-        c, s = np.cos(2 * np.pi * i / 5), np.sin(2 * np.pi * i / 5)
         spoke = slab((width + 0.015, 0.62 * radius, 0.2 * radius), (0.0, 0.33 * radius, 0.0), metal)
-        pieces.append(spoke.placed(frame_of((0, 0, 0), np.array([[1.0, 0, 0], [0, c, s], [0, -s, c]]))))
+        pieces.append(spoke.placed(frame_of((0, 0, 0), turn_x(2 * np.pi * i / 5))))
     return pieces
 
 
@@ -89,10 +92,7 @@ def driving(color: Color, path: Path, distance: Callable[[float], float], seed: 
 
     def poses(time: float) -> FloatArray:
         s = distance(time)
-        ahead = path(s + 0.1) - path(s - 0.1)
-        world = frame_of(path(s), turn_y(float(np.arctan2(ahead[0], ahead[2]))))
-        c, sine = np.cos(s / WHEEL_M), np.sin(s / WHEEL_M)
-        roll = np.array([[1.0, 0.0, 0.0], [0.0, c, sine], [0.0, -sine, c]])
+        world, roll = frame_of(path(s), turn_y(heading(path, s, 0.1))), turn_x(s / WHEEL_M)
         return np.stack([world, *(world @ frame_of(middle, roll) for middle in middles)])
 
     return Thing(pieces, frame, poses)
@@ -105,9 +105,7 @@ def skateboard() -> list[Piece]:
     pieces = [slab((0.2, 0.015, 0.56), (0, -0.105, 0), deck)]
     for end in (-1.0, 1.0):
         tip = slab((0.19, 0.015, 0.14), (0.0, 0.0, end * 0.07), deck)
-        c, s = np.cos(0.35 * end), np.sin(0.35 * end)
-        rise = np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
-        pieces.append(tip.placed(frame_of((0.0, -0.105, end * 0.275), rise)))
+        pieces.append(tip.placed(frame_of((0.0, -0.105, end * 0.275), turn_x(-0.35 * end))))
         pieces.append(slab((0.15, 0.03, 0.04), (0, -0.065, end * 0.2), metal))
         pieces += [slab((0.035, 0.054, 0.054), (x, -0.03, end * 0.2), wheel) for x in (-0.08, 0.08)]
     return pieces

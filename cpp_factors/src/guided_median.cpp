@@ -90,21 +90,21 @@ UNI4D_FG_INLINE void middle_of(const float* values, const float* weights, int co
   Lanes upto = half;
   half = 0.5F * half;
   for (int turn = 0; turn < count; ++turn) {
-    Lanes pivot, mass, before, after;
     bool is_done = true;
+    for (int lane = 0; lane < kSimdFloatWidth; ++lane) is_done &= !(least[lane] < most[lane]);
+    if (is_done) break;
+    Lanes pivot, mass, before, after;
     for (int i = 0; i < Lanes::kParts; ++i) {
-      const typename Lanes::Part zero{}, middle = 0.5F + zero;
+      const typename Lanes::Part zero{};
       auto share = (half.part[i] - below.part[i]) / (upto.part[i] - below.part[i]);
       share = share < kMostGuess ? share : kMostGuess + zero;
-      if (turn % 3 == 2) share = middle;
+      if (turn % 3 == 2) share = 0.5F + zero;
       const auto between = least.part[i] + share * (most.part[i] - least.part[i]);
       pivot.part[i] = (between >= least.part[i]) & (between < most.part[i]) ? between : least.part[i];
       mass.part[i] = zero;
       before.part[i] = -kInfinity + zero;
       after.part[i] = kInfinity + zero;
     }
-    for (int lane = 0; lane < kSimdFloatWidth; ++lane) is_done &= !(least[lane] < most[lane]);
-    if (is_done) break;
     for (int n = 0; n < count; ++n) {
       const Lanes value = load<Lanes>(values + n * kChunk), weight = load<Lanes>(weights + n * kChunk);
       for (int i = 0; i < Lanes::kParts; ++i) {
@@ -160,6 +160,7 @@ void guided_median(const WeightedMap& map, const std::uint8_t* chosen, const Med
                       &weights[count * kChunk]);
       }
       middle_of_chunk(values.data(), weights.data(), static_cast<int>(count), middle.data());
+      // Not finite where nothing around weighs anything.
       for (int k = 0; k < width; ++k)
         if (chosen[first + k] != 0 && std::isfinite(middle[static_cast<std::size_t>(k)]))
           out[first + k] = middle[static_cast<std::size_t>(k)];
