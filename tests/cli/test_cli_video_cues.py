@@ -169,6 +169,7 @@ def test_ctrl_c_while_cues_are_made_names_a_folder_that_exists(
     assert (tmp_path / "run").is_dir()
 
 
+@pytest.mark.slow
 def test_cues_up_to_scale_are_up_to_scale_in_another_run(cli: Run, clip: Path, tmp_path: Path) -> None:
     words = ["cues", clip, "--out", tmp_path / "made", "--set", "tracking.grid_columns=24", "--quiet"]
     code, _, err = cli(*words)

@@ -50,7 +50,7 @@ def test_a_pinhole_that_does_not_zoom_is_left_one(path, moving: int) -> None:  #
     assert structure(scene).camera.is_plain
 
 
-@pytest.mark.parametrize(("zoom", "count"), [(1.0, 0), (1.6, 1)])
+@pytest.mark.parametrize(("zoom", "count"), [(1.0, 0), pytest.param(1.6, 1, marks=pytest.mark.slow)])
 def test_cameras_are_grown_anew_only_where_those_at_hand_may_hide_a_zoom(
     zoom: float, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,7 +122,10 @@ def test_a_lens_that_explains_much_is_found_where_the_focal_length_is_open() -> 
     assert path_error(found, scene) < 0.001
 
 
-@pytest.mark.parametrize(("apart", "k1", "is_told"), [(1.1, -0.02, False), (1.04, -0.02, True), (1.1, -0.12, True)])
+@pytest.mark.parametrize(
+    ("apart", "k1", "is_told"),
+    [(1.1, -0.02, False), pytest.param(1.04, -0.02, True, marks=pytest.mark.slow), (1.1, -0.12, True)],
+)
 def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
     apart: float, k1: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,6 +140,7 @@ def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
         assert found.focal.low <= plain.intrinsics[:2].mean() <= found.focal.high
 
 
+@pytest.mark.slow
 def test_frames_that_are_blurred_do_not_tell_a_lens(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is found in them errs outward, as through a lens; told that they are blurred, the search leaves them out."""
     monkeypatch.setattr(camera_search, "halves_agree_on_lens", lambda *_: True)  # half of the tracks would tell as well

@@ -44,6 +44,7 @@ def solved(scene: TrackedScene) -> Structure:
     return found
 
 
+@pytest.mark.slow
 def test_what_bends_one_half_of_the_picture_is_no_lens(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = through(tracked(sideways(FRAMES), points=1500), below=0.5)
     found = solved(scene)
@@ -105,6 +106,7 @@ def test_halves_zoom_as_all_do(parts: tuple[float, ...], agree: bool, monkeypatc
     assert lens_agreement.halves_agree_on_zoom(whole, load_config("default", [])) is agree
 
 
+@pytest.mark.slow
 def test_what_grows_in_all_of_the_picture_is_a_zoom() -> None:
     scene = tracked(sideways(FRAMES), points=1500)
     seen = scene.observations

@@ -61,7 +61,7 @@ def solved(scene: TrackedScene, start: StartCameras | None = None) -> tuple[floa
     return metrics.ate_m / extent, metrics.rpe_rotation_deg, float(found.intrinsics[0]), float(body.mean())
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_somebody_who_sways_in_the_middle_does_not_bend_the_room(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = seated(seed)
     path, turn, focal, moving = solved(scene)

@@ -145,6 +145,7 @@ def test_a_rest_that_cannot_be_solved_changes_nothing(monkeypatch: pytest.Monkey
     assert structure_from_motion(street.observations, FRAMES, SIZE, GUESS, config, SilentReporter(), lambda: False)
 
 
+@pytest.mark.slow
 def test_without_another_scene_the_camera_only_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     street = passing(0, sway=0.6)
 

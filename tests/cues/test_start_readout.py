@@ -67,7 +67,9 @@ def found(scene: TrackedScene, any_camera: bool = True) -> tuple[Structure, floa
     return structure, turns
 
 
-@pytest.mark.parametrize(("part", "axis"), [(0.5, "rows"), (-0.4, "rows"), (0.5, "columns")])
+@pytest.mark.parametrize(
+    ("part", "axis"), [pytest.param(0.5, "rows", marks=pytest.mark.slow), (-0.4, "rows"), (0.5, "columns")]
+)
 def test_how_images_are_read_is_found_from_tracks(part: float, axis: Axis) -> None:
     scene = read_by(Readout(part, axis))
     structure, turns = found(scene)
@@ -87,6 +89,7 @@ def test_images_that_are_read_at_once_are_not_taken_for_others(seed: int) -> Non
     assert turns < 0.02
 
 
+@pytest.mark.slow
 def test_readouts_beyond_what_a_shutter_takes_are_not_believed() -> None:
     structure, _ = found(read_by(Readout(1.6)))
     assert structure.readout is None

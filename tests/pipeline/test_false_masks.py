@@ -22,7 +22,7 @@ SIZE = SyntheticSceneConfig(num_frames=11, height=240, width=320, focal=300.0, s
 
 
 @pytest.mark.skipif(find_extension()[0] is None, reason="needs the C++ extension")
-@pytest.mark.parametrize("from_motion", [True, False])
+@pytest.mark.parametrize("from_motion", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_what_stands_still_in_a_false_mask_is_as_good_as_beside_it(tmp_path: Path, from_motion: bool) -> None:
     """Of masks from motion; what a given one hides might follow the camera, and is not matched."""
     scene = make_synthetic_sequence(SIZE)

@@ -38,6 +38,7 @@ def facts(summary: RunSummary) -> str:
     return " ".join(summary.stages["tracks"]["facts"])
 
 
+@pytest.mark.slow
 def test_letterbox_is_left_out(scene: Sequence, tmp_path: Path) -> None:
     bar, (height, width) = 18, scene.image_size
 

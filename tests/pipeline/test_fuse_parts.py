@@ -37,7 +37,9 @@ class Elsewhere:
             yield index, pickle.loads(pickle.dumps(function(item, run_stage, Hooks())))
 
 
-@pytest.mark.parametrize(("broken", "matched"), [([], False), ([5, 17], False), ([5, 17], True)])
+@pytest.mark.parametrize(
+    ("broken", "matched"), [([], False), pytest.param([5, 17], False, marks=pytest.mark.slow), ([5, 17], True)]
+)
 def test_parts_have_the_bytes_of_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: list[int], matched: bool
 ) -> None:

@@ -252,6 +252,7 @@ def test_a_run_with_views_writes_them(tmp_path: Path) -> None:
     assert not folder.scene_picture.exists()
 
 
+@pytest.mark.slow
 def test_depth_from_motion_that_is_wrong_behind_edges_bends_no_cameras(tmp_path: Path) -> None:
     size = {"num_frames": 20, "grid_columns": 24, "grid_rows": 18}
     scene = make_scene(size, objects="none", noise=CueNoise.none())

@@ -211,6 +211,7 @@ def test_cancelling_anywhere_and_resuming_ends_the_same(
         assert_same_result(run_dir, undisturbed)
 
 
+@pytest.mark.slow
 def test_cancelling_again_and_again_never_loses_a_finished_stage(
     tmp_path: Path, sequence: Sequence, undisturbed: Path
 ) -> None:

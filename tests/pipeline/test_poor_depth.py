@@ -67,7 +67,7 @@ def extent_of(sequence: Sequence) -> float:
     return float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
 
 
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_poor_cue_does_not_bend_the_cameras(tmp_path: Path, seed: int) -> None:
     sequence = poor(seed)
     focal, path, log_scale = errors(sequence, tmp_path / "found")
@@ -85,6 +85,7 @@ def test_a_sound_cue_is_used(tmp_path: Path) -> None:
     assert STEP not in summary.stages
 
 
+@pytest.mark.slow
 def test_a_lens_is_found_without_a_poor_cue(tmp_path: Path) -> None:
     sequence = poor(camera_model="SIMPLE_RADIAL", distortion=(-0.12,))
     summary, found = run_sound(sequence, tmp_path, make_config())
@@ -133,6 +134,7 @@ def test_a_camera_that_only_turns_keeps_the_cameras_of_the_cue(tmp_path: Path) -
     assert evaluate_run(tmp_path, sequence).to_dict()["trajectory"]["rpe_rotation_deg"] < 0.05
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_there_goes_on(tmp_path: Path) -> None:
     sequence, config = poor(), make_config("fusion.multiview.enabled=false")
     undisturbed = reconstruct(sequence, tmp_path / "undisturbed", config)

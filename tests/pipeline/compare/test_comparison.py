@@ -43,7 +43,7 @@ def compared(sequence: Sequence, folder: Path, preset: str, resume: bool = False
     return compare_sequence(sequence, preset, config, solver_variants([]), folder / preset, BUDGET, resume=resume)
 
 
-@pytest.fixture(scope="module", params=["default", "paper"])
+@pytest.fixture(scope="module", params=["default", pytest.param("paper", marks=pytest.mark.slow)])
 def comparison(request: pytest.FixtureRequest, sequence: Sequence, folder: Path) -> Comparison:
     return compared(sequence, folder, request.param)
 

@@ -55,6 +55,7 @@ def settled_picture(page: Any) -> np.ndarray:
     return last
 
 
+@pytest.mark.slow
 def test_lines_look_as_viser_draws_them(finished_run: Path) -> None:
     import cv2
 
@@ -133,7 +134,7 @@ _WATCH = """
 """
 
 
-@pytest.mark.parametrize("points_are_seen", [True, False])
+@pytest.mark.parametrize("points_are_seen", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_panel_comes_with_the_first_points_or_after_three_seconds(
     finished_run: Path, points_are_seen: bool
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from stream_samples import stream_config
 
 from uni4d_fg.frontend.synthetic.hall import HallConfig, given_intrinsics, hall_frames, hall_poses
@@ -34,6 +35,7 @@ def resident_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 
+@pytest.mark.slow
 def test_memory_is_flat_and_the_path_does_not_drift() -> None:
     results = Counted()
     solver = IncrementalReconstructor(

@@ -61,6 +61,7 @@ def fused(sequence: Sequence, folder: Path, *changes: str) -> tuple[float, float
     return float(error.mean()), float(np.mean(error[sure[static]] < 0.03)), stage["matched_frames"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_extension()[0] is None, reason="needs the C++ extension")
 def test_depth_through_a_lens_is_as_good_as_through_a_pinhole(tmp_path: Path) -> None:
     error, right, matched = fused(scene(PINHOLE, 150.0), tmp_path / "straight")

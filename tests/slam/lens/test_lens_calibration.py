@@ -97,6 +97,7 @@ def test_ideal_tracks_are_those_of_the_pinhole(barrel: Sequence) -> None:
     assert CameraModel(truth).ideal_labelled(real) is real
 
 
+@pytest.mark.slow
 def test_a_run_through_a_lens_is_as_good_as_one_without(barrel: Sequence, tmp_path: Path) -> None:
     errors = {}
     for name, sequence in (("straight", scene_behind(PINHOLE)), ("barrel", barrel)):
@@ -241,7 +242,9 @@ def test_a_second_parameter_needs_less_energy_and_held_out_tracks(
     assert is_taken(candidate, CameraConfig(), (480, 640), after_another=True) is taken
 
 
-@pytest.mark.parametrize("lens", [Lens("SIMPLE_RADIAL", (-0.12,)), Lens("RADIAL", (-0.25, 0.1))])
+@pytest.mark.parametrize(
+    "lens", [pytest.param(Lens("SIMPLE_RADIAL", (-0.12,)), marks=pytest.mark.slow), Lens("RADIAL", (-0.25, 0.1))]
+)
 def test_one_or_two_parameters_as_the_lens_has_them(lens: Lens) -> None:
     """A lens of one parameter alone errs by 0.7 % in the tangents of its directions where two are needed."""
     sequence = scene_behind(lens, num_frames=30, grid_columns=29, grid_rows=23)
@@ -258,6 +261,7 @@ def test_one_or_two_parameters_as_the_lens_has_them(lens: Lens) -> None:
     assert ratio.max() / ratio.min() < 1.006
 
 
+@pytest.mark.slow
 def test_a_lens_is_no_zoom() -> None:
     """A camera that moves along its view through a lens: a focal length per frame explains much of the distortion."""
     lens = Lens("RADIAL", (-0.25, 0.1))

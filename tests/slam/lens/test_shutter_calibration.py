@@ -51,6 +51,7 @@ def with_a_pinhole(labelled: LabelledTracks) -> FoundReadout:
     return ReadoutFit(labelled, TIMES, SIZE, camera, load_config("default", [])).find()
 
 
+@pytest.mark.slow
 def test_a_lens_behind_a_rolling_shutter_is_found_without_what_the_shutter_does(rolled: LabelledTracks) -> None:
     alone = calibrate_lens(rolled, SIZE, GUESS, load_config("default", []))
     assert abs(alone.intrinsics[0] / K[0] - 1) > 0.3  # a zoom that is none
