@@ -9,7 +9,10 @@ class MultiviewConfig(Section):
     """Depth of the static scene by matching frames, with the solved cameras."""
 
     enabled: bool = setting(True, "Match frames; otherwise dense depth is the corrected cue alone.")
-    longer_side_px: int = setting(320, "Frames are matched at a size whose longer side is at most this, px.", ge=32)
+    longer_side_px: int = setting(
+        448, "Frames are matched at half their size, with a longer side of at most this, px, ...", ge=32
+    )
+    least_side_px: int = setting(320, "... and of at least this, where they are that large.", ge=32)
     views: int = setting(4, "Frames that a frame is matched with, at most.", ge=1, le=16)
     reach: int = setting(16, "They are at most this many frames away.", ge=1)
     min_overlap: float = setting(0.5, "A view sees at least this part of the frame's landmarks.", ge=0, le=1)

@@ -20,7 +20,7 @@ from uni4d_fg.results.fusion.carried import carried_depth
 from uni4d_fg.results.fusion.densify import ControlPoints, SomeControlPoints, densify_frame
 from uni4d_fg.results.fusion.guided_median import guided_median
 from uni4d_fg.results.fusion.lifting import lifted
-from uni4d_fg.results.fusion.mask_band import FARTHEST_PX, STILL, FittedMask, compare, fitted_mask, looks_moving
+from uni4d_fg.results.fusion.mask_band import STILL, FittedMask, compare, farthest_px, fitted_mask, looks_moving
 from uni4d_fg.results.fusion.matching_choice import adds_nothing, bleeding_of, is_poor, is_preferred, tells_bleeding
 from uni4d_fg.results.fusion.moving_depth import carried_moving, correct_moving, without_bleeding
 from uni4d_fg.results.fusion.multiview.measured import Measured, MultiviewDepth
@@ -179,7 +179,7 @@ class DenseMaps:
             if measured is not None and tells_bleeding(judged.errors):
                 edges.append(self._edge_profile(sound[at], judged, measured))
         bleeding_px = bleeding_radius([profile for profile in edges if profile is not None])
-        self.bleeding_px = bleeding_of(bleeding_px, poor=self._cue_is_poor)
+        self.bleeding_px = bleeding_of(bleeding_px, poor=self._cue_is_poor, finer=self.size.times_finer)
         # One choice for the whole video: between frames that are matched and others that are not, surfaces would jump.
         preferred = [self._prefers(errors) for errors in tried]
         self.prefers_matching = 2 * sum(preferred) > len(preferred)
@@ -291,7 +291,7 @@ class DenseMaps:
         # The frames next to it mostly have their masks in the same place.
         near = [number for number in self._near(frame) if abs(number - frame) > 1] or self._near(frame)
         masked = self.size.within(~self._static(frame).unmasked, False)
-        around = ~without_band(~masked, FARTHEST_PX)
+        around = ~without_band(~masked, farthest_px(self.size.times_finer))
         return background(self._view(frame), map(self._view, near), around)
 
     def _fitted(self, frame: int, mask: Int32Array, behind: Background) -> FittedMask:

@@ -27,6 +27,7 @@ from uni4d_fg.pipeline.window_workers import WindowWorkers
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.confidence_store import ConfidenceWriter, write_confidence
 from uni4d_fg.results.depth_store import DepthWriter, write_depth
+from uni4d_fg.results.fusion.matching_size import matching_side, settings_of_side
 from uni4d_fg.results.fusion.multiview.ideal_size import ideal_size
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 from uni4d_fg.results.fusion.told_error import ToldError
@@ -82,7 +83,9 @@ def fuse_depth(
     intrinsics = zoomed(scene["intrinsics"], zoom, sequence.num_frames)
     known = static.of(scene)
     control = [with_moving(points, labelled, scene, motion, frame) for frame, points in enumerate(known.frames)]
-    plain = WorkingSize.of(sequence.image_size, config.multiview.longer_side_px)
+    plain = WorkingSize.of(sequence.image_size, matching_side(sequence.image_size, config.multiview))
+    settings = settings_of_side(config.multiview, max(plain.height, plain.width))
+    config = config.model_copy(update={"multiview": settings})
     size = ideal_size(plain, lens, intrinsics[0]) if zoom is None else plain
     maps = DenseMaps(
         sequence,

@@ -14,11 +14,13 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
 from uni4d_fg.optim.extension import find_extension
+from uni4d_fg.results.fusion.matching_size import times_finer
 
 _UNSURE = 0.5
 """Pixels of a lower confidence are replaced."""
-_REACH_PX, _STEP_PX = 12, 4
-"""Every fourth pixel of a window of this half side is looked at: rims of what is near are up to ten wide."""
+_STEPS, _STEP_PX = 3, 4.0
+"""So many pixels to each side are looked at, one in four: rims of what is near are up to ten wide (working px of the
+usual size, as all that follows)."""
 _SPATIAL_PX = 6.0
 """Standard deviation of the weights by distance ..."""
 _COLOR = 0.05
@@ -29,8 +31,8 @@ _FARTHEST = np.float32(60.0)
 """Exponent beyond which pixels are equally unlike."""
 _STEEPEST = np.float32(0.3)
 """A plane changes inverse depth by at most this part on its way to a pixel."""
-_SLOPE_WINDOW = (11, 11)
-"""Slopes are means over such windows ..."""
+_SLOPE_PX = 5
+"""Slopes are means over windows of this half side ..."""
 _ONE_SURFACE = np.float32(0.05)
 """... of the differences of neighbors whose log depth differs by less."""
 
@@ -56,13 +58,15 @@ def guided_median(
     weights = np.where(known, confidence + _LEAST, np.float32(0)).astype(np.float32)
     inverse = np.exp(-np.where(known, log_depth, np.float32(0))).astype(np.float32)
     slopes = _slopes(inverse, weights)
+    finer = times_finer(inverse.shape)
+    step = round(_STEP_PX * finer)
     core, _ = find_extension()
     if core is None:
         found = guided_median_numpy(inverse, weights, slopes, colors, chosen)
     else:
         found = core.guided_median(
-            inverse, weights, slopes, colors, chosen.astype(np.uint8), reach=_REACH_PX, step=_STEP_PX,
-            spatial=_SPATIAL_PX, steepest=float(_STEEPEST),
+            inverse, weights, slopes, colors, chosen.astype(np.uint8), reach=_STEPS * step, step=step,
+            spatial=_SPATIAL_PX * finer, steepest=float(_STEEPEST),
         )  # fmt: skip
     return np.where(chosen, -np.log(found), log_depth)
 
@@ -75,6 +79,7 @@ def _slopes(inverse: Float32Array, weights: Float32Array) -> Float32Array:
         weights: (h, w), 0 where it is missing.
     """
     limit = 1 + _ONE_SURFACE
+    window = (2 * round(_SLOPE_PX * times_finer(inverse.shape)) + 1,) * 2
     slopes = np.zeros((*inverse.shape, 2), np.float32)
     for axis in (0, 1):
         # Neighbors, along the axis; the last row or column has none.
@@ -83,7 +88,7 @@ def _slopes(inverse: Float32Array, weights: Float32Array) -> Float32Array:
         sure = np.minimum(weights[here], weights[there]) * ((other < limit * one) & (one < limit * other))
         grows, total = np.zeros_like(inverse), np.zeros_like(inverse)
         grows[here], total[here] = sure * (other - one), sure
-        mean = cv2.blur(grows, _SLOPE_WINDOW) / np.maximum(cv2.blur(total, _SLOPE_WINDOW), _LEAST)
+        mean = cv2.blur(grows, window) / np.maximum(cv2.blur(total, window), _LEAST)
         slopes[..., axis] = mean / inverse
     return slopes
 
@@ -104,13 +109,17 @@ def guided_median_numpy(
     row, column = np.nonzero(chosen)
     color, weight, slope = colors.reshape(-1, 3), weights.ravel(), slopes.reshape(-1, 2)
     value, own = np.where(weights > 0, values, np.float32(0)).ravel(), color[row * width + column]
-    taps = range(-_REACH_PX, _REACH_PX + 1, _STEP_PX)
+    finer = times_finer(values.shape)
+    step = round(_STEP_PX * finer)
+    taps = range(-_STEPS * step, _STEPS * step + 1, step)
     around = np.empty((len(taps) ** 2, row.size), np.float32)
     weighed = np.empty_like(around)
     for number, (dy, dx) in enumerate((dy, dx) for dy in taps for dx in taps):
         inside = (row + dy >= 0) & (row + dy < height) & (column + dx >= 0) & (column + dx < width)
         at = np.where(inside, (row + dy) * width + column + dx, 0)
-        unlike = ((color[at] - own) ** 2).sum(axis=1) + np.float32((dy * dy + dx * dx) / (2 * _SPATIAL_PX**2))
+        unlike = ((color[at] - own) ** 2).sum(axis=1) + np.float32(
+            (dy * dy + dx * dx) / (2 * (_SPATIAL_PX * finer) ** 2)
+        )
         back = -(np.float32(dy) * slope[at, 0] + np.float32(dx) * slope[at, 1])
         around[number] = value[at] * (1 + np.clip(back, -_STEEPEST, _STEEPEST))
         weighed[number] = np.where(inside, weight[at] * np.exp(-np.minimum(unlike, _FARTHEST)), np.float32(0))

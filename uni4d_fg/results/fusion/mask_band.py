@@ -10,11 +10,12 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array, IntArray
 from uni4d_fg.cues.mask_distance import shrunk_mask
 from uni4d_fg.results.fusion.background import Background
+from uni4d_fg.results.fusion.matching_size import times_finer
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 from uni4d_fg.results.nearest import nearest_known
 
 _AROUND_PX = 4.0
-"""Standard deviation of the window whose colors a pixel is compared with, working px."""
+"""Standard deviation of the window whose colors a pixel is compared with, working px of the usual size."""
 _COLOR_NOISE = 1e-3
 """Least variance of colors, of 1."""
 _NONE_AROUND = 0.01
@@ -23,12 +24,12 @@ _WHOLE = 0.99
 STILL = 0.6
 """Pixels of a mask whose depth several frames show with this confidence are taken to stand still."""
 _RIM_PX, _RIM_STILL, _MIN_RIM = 2, 0.5, 20
-"""A mask is too large if so much of its rim, that wide, looks like what is behind: of masks that fit 0 to 0.3 does, of
-others 0.6 to 1. With fewer pixels that others see, it is not told."""
+"""A mask is too large if so much of its rim, that wide (alike), looks like what is behind: of masks that fit 0 to 0.3
+does, of others 0.6 to 1. With fewer pixels that others see, it is not told."""
 _REACH_PX = 6.0
-"""Colors of what moves are those farther inside, working px."""
-FARTHEST_PX = 12
-"""Masks that are too large reach no farther beyond what moves, and what moves no farther beyond others, working px."""
+"""Colors of what moves are those farther inside, alike."""
+_FARTHEST_PX = 12
+"""Masks that are too large reach no farther beyond what moves, and what moves no farther beyond others, alike."""
 _USUAL = 0.15
 """Nine tenths of the pixels that move have a confidence below 0.25."""
 _LARGEST, _PER_COLOR, _PER_CONFIDENCE = 8.0, 0.3, 0.13
@@ -41,9 +42,14 @@ _TELLS = 0.1
 """A smaller ratio is rounding."""
 _HALF = 0.5
 _SMOOTH_PX = 1.5
-"""What says that a pixel beside a mask moves is blurred by this, working px."""
+"""What says that a pixel beside a mask moves is blurred by this, alike."""
 _GROWN, _PER_SHARE, _PER_LIKENESS = 0.37, 1.07, 0.24
 """Log odds that it does: a constant, and what the share of its ring and its own colors count; fitted likewise."""
+
+
+def farthest_px(finer: float) -> int:
+    """Return how far masks may reach beyond what moves, and what moves beyond them, px of maps so much finer."""
+    return round(_FARTHEST_PX * finer)
 
 
 class FittedMask(NamedTuple):
@@ -146,9 +152,11 @@ def stands_still(compared: Compared, matched: Float32Array) -> BoolArray:
     if not inside.any():
         return still
     depth = cv2.distanceTransform(np.pad(inside.astype(np.uint8), 1, mode="edge"), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    deep = inside & (depth > _REACH_PX)
+    finer = times_finer(depth.shape)
+    farthest = farthest_px(finer)
+    deep = inside & (depth > _REACH_PX * finer)
     ring = np.ceil(depth).astype(np.int64)
-    along = inside & (ring <= FARTHEST_PX)
+    along = inside & (ring <= farthest)
     seen = along & compared.seen
     if not deep.any():
         return still
@@ -160,13 +168,13 @@ def stands_still(compared: Compared, matched: Float32Array) -> BoolArray:
     likely = _PER_COLOR * like_behind + _PER_CONFIDENCE * confident
     for label in np.unique(compared.instance[seen]).tolist():
         mine = along & (compared.instance == label)
-        rim = like_behind[mine & seen & (ring <= _RIM_PX)]
+        rim = like_behind[mine & seen & (ring <= _RIM_PX * finer)]
         if len(rim) < _MIN_RIM or float((rim > 0).mean()) < _RIM_STILL:
             continue
-        share = _share_by_ring(ring, mine & seen, like_behind > 0)
+        share = _share_by_ring(ring, farthest, mine & seen, like_behind > 0)
         # Farther inside than the mask is too large, what looks like the scene behind only looks like it.
         reached = mine & (ring <= np.count_nonzero(share >= _RIM_STILL))
-        odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
+        odds = np.log(share / (1 - share))[np.minimum(ring, farthest)]
         still |= reached & (odds + likely > 0)
     return still
 
@@ -189,20 +197,22 @@ def moves_beside(compared: Compared, matched: Float32Array) -> BoolArray:
     if not inside.any():
         return np.zeros_like(inside)
     ring = np.ceil(cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 3)).astype(np.int64)
-    along = outside & (ring <= FARTHEST_PX) & (matched <= STILL)
+    finer = times_finer(ring.shape)
+    farthest = farthest_px(finer)
+    along = outside & (ring <= farthest) & (matched <= STILL)
     seen = along & compared.seen
     like_moving = _log_likelihood(compared.color, inside) - compared.like_background - np.float32(_ALIKE)
     like_moving = np.where(seen, np.clip(like_moving, -_LARGEST, _LARGEST), np.float32(0))
-    share = _share_by_ring(ring, seen, like_moving > _TELLS)
-    odds = np.log(share / (1 - share))[np.minimum(ring, FARTHEST_PX)]
-    around = cv2.GaussianBlur(like_moving, (0, 0), _SMOOTH_PX)
+    share = _share_by_ring(ring, farthest, seen, like_moving > _TELLS)
+    odds = np.log(share / (1 - share))[np.minimum(ring, farthest)]
+    around = cv2.GaussianBlur(like_moving, (0, 0), _SMOOTH_PX * finer)
     return np.asarray(along & (_GROWN + _PER_SHARE * odds + _PER_LIKENESS * around > 0))
 
 
-def _share_by_ring(ring: IntArray, seen: BoolArray, alike: BoolArray) -> FloatArray:
+def _share_by_ring(ring: IntArray, farthest: int, seen: BoolArray, alike: BoolArray) -> FloatArray:
     """Return in which part of the pixels that are seen something is alike, by their distance, which it falls with."""
-    many = np.bincount(ring[seen], minlength=FARTHEST_PX + 1) + 1.0
-    share = np.bincount(ring[seen & alike], minlength=FARTHEST_PX + 1) / many
+    many = np.bincount(ring[seen], minlength=farthest + 1) + 1.0
+    share = np.bincount(ring[seen & alike], minlength=farthest + 1) / many
     return np.clip(np.minimum.accumulate(np.append(1.0, share[1:])), 0.02, 0.98)
 
 
@@ -223,11 +233,11 @@ def _shrunk(image: ImageArray, mask: Int32Array, shape: tuple[int, ...]) -> tupl
 
 def _log_likelihood(image: Float32Array, region: BoolArray) -> Float32Array:
     """Return that of each pixel (h, w) of an image (h, w, 3), of 1, under the colors of a region nearby."""
-    weight = region.astype(np.float32)
-    mass = cv2.GaussianBlur(weight, (0, 0), _AROUND_PX)
+    weight, around = region.astype(np.float32), _AROUND_PX * times_finer(region.shape)
+    mass = cv2.GaussianBlur(weight, (0, 0), around)
     share = np.maximum(mass, 1e-6)[..., None]
-    mean = cv2.GaussianBlur(image * weight[..., None], (0, 0), _AROUND_PX) / share
-    square = cv2.GaussianBlur(image**2 * weight[..., None], (0, 0), _AROUND_PX) / share
+    mean = cv2.GaussianBlur(image * weight[..., None], (0, 0), around) / share
+    square = cv2.GaussianBlur(image**2 * weight[..., None], (0, 0), around) / share
     variance = np.maximum(square - mean**2, 0) + np.float32(_COLOR_NOISE)
     value = -0.5 * ((image - mean) ** 2 / variance + np.log(variance)).sum(axis=2)
     return np.where(mass > _NONE_AROUND, value, np.float32(-np.inf)).astype(np.float32)

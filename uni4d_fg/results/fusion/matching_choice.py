@@ -17,9 +17,9 @@ _FAR_WORSE = 4.0
 _POOR = 0.04
 """Noise, a standard deviation of the log depth, from which a cue is a network's."""
 _POOR_BLEEDS_PX, _NOT_WORSE_THAN_POOR = 6.0, 3.0
-"""A poor cue bleeds across edges by the first, working px, at least, whether a few frames show it or not, and only
-matched depth has its edges right. Landmarks prefer it all the same, as others beside them made or corrected it: matched
-depth is used below the second."""
+"""A poor cue bleeds across edges by the first, working px of the usual size, at least, whether a few frames show it or
+not, and only matched depth has its edges right. Landmarks prefer it all the same, as others beside them made or
+corrected it: matched depth is used below the second."""
 
 
 def is_poor(noise: float, depth_parallax: bool | None) -> bool:
@@ -45,14 +45,15 @@ def tells_bleeding(errors: HeldOut) -> bool:
     return _counts(errors, _NOT_WORSE, bleeds=True)
 
 
-def bleeding_of(radius: float, *, poor: bool) -> float:
+def bleeding_of(radius: float, *, poor: bool, finer: float = 1.0) -> float:
     """Return how far a cue bleeds, working px; 0 for one that has the detail of edges.
 
     Args:
         radius: As edges tell, working px; NaN if they do not.
         poor: See :func:`is_poor`.
+        finer: How many times as fine as usual the working size is.
     """
-    radius = max(radius if np.isfinite(radius) else 0.0, _POOR_BLEEDS_PX if poor else 0.0)
+    radius = max(radius if np.isfinite(radius) else 0.0, finer * _POOR_BLEEDS_PX if poor else 0.0)
     return radius if radius > _SHARP_PX else 0.0
 
 

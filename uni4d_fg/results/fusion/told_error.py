@@ -19,6 +19,7 @@ import numpy as np
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray
 from uni4d_fg.results.fusion.averaging import Averaged
 from uni4d_fg.results.fusion.log_range import log_range
+from uni4d_fg.results.fusion.matching_size import times_finer
 
 _WEIGHTS = np.array([-2.2, 0.554, 3.029, 0.499, -2.556], dtype=np.float32)
 _MANY_FRAMES = 4
@@ -77,15 +78,16 @@ def without_texture(sure: Float32Array, gray: Float32Array, radius: int) -> Floa
     Args:
         sure: (h, w).
         gray: (h, w), of 1; NaN where missing.
-        radius: Half side of the window, px.
+        radius: Half side of the window, working px of the usual size.
     """
-    window = (2 * radius + 1,) * 2
+    finer = times_finer(gray.shape)
+    window = (2 * round(finer * radius) + 1,) * 2
     known = np.isfinite(gray)
     value = np.where(known, gray, np.float32(0))
     share = np.maximum(cv2.blur(known.astype(np.float32), window), np.float32(1e-6))
     mean, square = (cv2.blur(part, window) / share for part in (value, value * value))
     varies = np.sqrt(np.maximum(square - mean * mean, 0))
-    odds = np.minimum(varies / _PLAIN, np.float32(1)) ** _PLAINER
+    odds = np.minimum(varies / np.float32(finer * _PLAIN), np.float32(1)) ** _PLAINER
     return np.asarray(sure * odds / (1 - sure + sure * odds + np.float32(1e-9)), np.float32)
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray, Int32Array
+from uni4d_fg.results.fusion.matching_size import times_finer
 
 ONE_SURFACE = 0.04
 """Log depths that differ by less are averaged."""
@@ -28,6 +29,11 @@ class WorkingSize:
     def plain(self) -> WorkingSize:
         """The same without a lens: that of the shrunk images, whatever bends them."""
         return self
+
+    @property
+    def times_finer(self) -> float:
+        """How many times as fine as usual the shrunk images are, at least 1."""
+        return times_finer((self.plain.height, self.plain.width))
 
     @classmethod
     def of(cls, image_size: tuple[int, int], longer_side: int) -> WorkingSize:
