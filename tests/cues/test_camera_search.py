@@ -89,7 +89,8 @@ def test_a_weak_lens_must_gain_more_than_errors_of_a_tracker(k1: float, gain: fl
 
 
 @pytest.mark.parametrize(
-    ("path", "gain", "is_told"), [(sideways, 0.005, True), (forward, 0.01, False), (forward, 0.03, True)]
+    ("path", "gain", "is_told"),
+    [(sideways, 0.005, True), (forward, 0.01, False), pytest.param(forward, 0.03, True, marks=pytest.mark.slow)],
 )
 def test_a_lens_is_not_believed_where_the_focal_length_is_open_unless_it_explains_much(
     path: Callable[[int], np.ndarray], gain: float, is_told: bool, monkeypatch: pytest.MonkeyPatch

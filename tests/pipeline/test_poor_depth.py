@@ -109,6 +109,7 @@ def test_a_zoom_beside_a_poor_cue_is_the_one_of_the_tracks(tmp_path: Path) -> No
     assert path["ate_m"] < 1e-3 * extent_of(sequence)
 
 
+@pytest.mark.slow
 def test_a_zoom_that_only_a_poor_cue_asks_for_is_not_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = poor()
 

@@ -152,7 +152,7 @@ def test_a_cut_that_larger_images_do_not_show_is_none(monkeypatch: pytest.Monkey
     assert find_cuts(ArrayFrames(np.stack(twice)), CONFIG) == ()
 
 
-@pytest.mark.parametrize(("part", "is_one"), [(1.0, True), (0.4, False)])
+@pytest.mark.parametrize(("part", "is_one"), [pytest.param(1.0, True, marks=pytest.mark.slow), (0.4, False)])
 def test_a_dissolve_that_larger_images_do_not_show_must_be_explained(
     monkeypatch: pytest.MonkeyPatch, part: float, is_one: bool
 ) -> None:

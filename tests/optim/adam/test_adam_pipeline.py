@@ -47,7 +47,7 @@ def config(preset: str, *overrides: str) -> Config:
     return load_config(preset, ["solver=adam", *LIMITS, *NO_VIEWS, *overrides])
 
 
-@pytest.mark.parametrize("preset", ["paper", "default"])
+@pytest.mark.parametrize("preset", [pytest.param("paper", marks=pytest.mark.slow), "default"])
 def test_a_run_is_complete_can_be_scored_and_is_resumed(preset: str, sequence: Sequence, tmp_path: Path) -> None:
     reconstruct(sequence, tmp_path, config(preset))
     folder = RunFolder(tmp_path)

@@ -96,6 +96,7 @@ def test_large_arrays_are_not_mapped_anew_each_time(client: Any) -> None:
     assert max(faults) < 20_000
 
 
+@pytest.mark.slow
 def test_a_script_that_workers_cannot_load_is_told_so(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(

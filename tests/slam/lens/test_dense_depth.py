@@ -74,6 +74,7 @@ def test_depth_through_a_lens_is_as_good_as_through_a_pinhole(tmp_path: Path) ->
         assert bent[1] > right - 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_extension()[0] is None, reason="needs the C++ extension")
 def test_frames_that_zoom_are_matched(tmp_path: Path) -> None:
     still = scene(PINHOLE, 150.0)

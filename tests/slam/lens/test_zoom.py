@@ -117,6 +117,7 @@ def test_a_zoom_that_distortion_seems_to_explain_is_compared_with_the_lens(monke
     assert "better than the lens does" in found.zoom.notes[1]
 
 
+@pytest.mark.slow
 def test_a_lens_is_no_zoom_however_loudly_tracks_ask_for_one() -> None:
     plain = scene(num_frames=20)
     assert plain.ground_truth.intrinsics is not None
