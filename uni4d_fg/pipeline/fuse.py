@@ -27,7 +27,7 @@ from uni4d_fg.pipeline.window_workers import WindowWorkers
 from uni4d_fg.progress import Reporter
 from uni4d_fg.results.confidence_store import ConfidenceWriter, write_confidence
 from uni4d_fg.results.depth_store import DepthWriter, write_depth
-from uni4d_fg.results.fusion.matching_size import matching_side, settings_of_side
+from uni4d_fg.results.fusion.matching_size import finer_settings, matching_side
 from uni4d_fg.results.fusion.multiview.ideal_size import ideal_size
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
 from uni4d_fg.results.fusion.told_error import ToldError
@@ -84,8 +84,7 @@ def fuse_depth(
     known = static.of(scene)
     control = [with_moving(points, labelled, scene, motion, frame) for frame, points in enumerate(known.frames)]
     plain = WorkingSize.of(sequence.image_size, matching_side(sequence.image_size, config.multiview))
-    settings = settings_of_side(config.multiview, max(plain.height, plain.width))
-    config = config.model_copy(update={"multiview": settings})
+    config = config.model_copy(update={"multiview": finer_settings(config.multiview, plain.times_finer)})
     size = ideal_size(plain, lens, intrinsics[0]) if zoom is None else plain
     maps = DenseMaps(
         sequence,

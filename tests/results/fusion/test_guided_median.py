@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from uni4d_fg.optim.extension import find_extension
 from uni4d_fg.results.fusion.guided_median import guided_median, guided_median_numpy
-from uni4d_fg.results.fusion.matching_size import times_finer
 
 SHAPE = (40, 60)
 EVERYWHERE = np.ones(SHAPE, bool)
@@ -80,8 +79,13 @@ def test_depth_stays_among_what_is_there(seed: int, side: int) -> None:
         assert apart.max() < 1e-5
 
 
-@pytest.mark.parametrize(("height", "width"), [(40, 60), (7, 50), (1, 1), (20, 430)])
-def test_cpp_and_numpy_agree(rng: np.random.Generator, height: int, width: int) -> None:
+@pytest.mark.parametrize(
+    ("height", "width", "reach", "step", "spatial"),
+    [(40, 60, 12, 4, 6.0), (7, 50, 12, 4, 6.0), (1, 1, 12, 4, 6.0), (20, 430, 15, 5, 8.0), (40, 60, 18, 6, 8.4)],
+)
+def test_cpp_and_numpy_agree(
+    rng: np.random.Generator, height: int, width: int, reach: int, step: int, spatial: float
+) -> None:
     core, reason = find_extension()
     if core is None:
         pytest.skip(reason)
@@ -92,13 +96,10 @@ def test_cpp_and_numpy_agree(rng: np.random.Generator, height: int, width: int) 
     colors = rng.normal(0, 0.4, (height, width, 3)).astype(np.float32)
     slopes = rng.normal(0, 0.03, (height, width, 2)).astype(np.float32)
     chosen = ((rng.random((height, width)) < 0.8) & (weights > 0)) | (weights.size == 1)
-    slow = guided_median_numpy(values, weights, slopes, colors, chosen)
-    finer = times_finer((height, width))
-    step = round(4 * finer)
+    slow = guided_median_numpy(values, weights, slopes, colors, chosen, reach, step, spatial)
     fast = core.guided_median(
-        values, weights, slopes, colors, chosen.astype(np.uint8), reach=3 * step, step=step, spatial=6.0 * finer,
-        steepest=0.3,
-    )  # fmt: skip
+        values, weights, slopes, colors, chosen.astype(np.uint8), reach=reach, step=step, spatial=spatial, steepest=0.3
+    )
     np.testing.assert_array_equal(fast[~chosen], values[~chosen])
     # Where half of the weight is met to the last bits, the next value may be taken.
     assert np.isclose(fast, slow, rtol=1e-5, atol=1e-6)[chosen].mean() > 0.999

@@ -9,7 +9,7 @@ import pytest
 from uni4d_fg.config.multiview import MultiviewConfig
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.results.fusion.matching_choice import bleeding_of
-from uni4d_fg.results.fusion.matching_size import USUAL_SIDE, matching_side, settings_of_side, times_finer
+from uni4d_fg.results.fusion.matching_size import USUAL_SIDE, finer_settings, matching_side, times_finer
 from uni4d_fg.results.fusion.multiview.ideal_size import ideal_size
 from uni4d_fg.results.fusion.multiview.sweep import sweep
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
@@ -44,12 +44,13 @@ def test_who_wants_less_gets_less() -> None:
 
 def test_settings_stay_at_the_usual_size_and_below() -> None:
     for side in (100, USUAL_SIDE):
-        assert settings_of_side(GIVEN, side) == GIVEN
-    finer = settings_of_side(GIVEN, 2 * USUAL_SIDE)
+        assert finer_settings(GIVEN, times_finer((side,))) == GIVEN
+    finer = finer_settings(GIVEN, times_finer((2 * USUAL_SIDE,)))
     assert finer.image_noise == 2 * GIVEN.image_noise
     assert finer.large_step_penalty == 4 * GIVEN.large_step_penalty
     assert (finer.small_step_penalty, finer.mask_band_px) == (120, 6)
-    assert settings_of_side(MultiviewConfig(small_step_penalty=200), 640).small_step_penalty == 255  # of a byte
+    assert finer_settings(MultiviewConfig(small_step_penalty=200), 2.0).small_step_penalty == 255  # of a byte
+    assert finer_settings(MultiviewConfig(large_step_penalty=900), 2.0).large_step_penalty == 1000
     assert bleeding_of(np.nan, poor=True, finer=2.0) == 2 * bleeding_of(np.nan, poor=True)
 
 
@@ -90,4 +91,4 @@ def test_a_plain_wall_is_flatter_with_the_settings_of_its_size(rng: np.random.Ge
         assert np.median(found[10:-10, 10:115]) == pytest.approx(1.0, abs=0.03)
         return float(np.std(found[10:-10, 135:315]))
 
-    assert unevenness(settings_of_side(GIVEN, side)) < 0.8 * unevenness(GIVEN)
+    assert unevenness(finer_settings(GIVEN, side / USUAL_SIDE)) < 0.8 * unevenness(GIVEN)

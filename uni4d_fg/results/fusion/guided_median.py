@@ -60,13 +60,14 @@ def guided_median(
     slopes = _slopes(inverse, weights)
     finer = times_finer(inverse.shape)
     step = round(_STEP_PX * finer)
+    reach, spatial = _STEPS * step, _SPATIAL_PX * finer
     core, _ = find_extension()
     if core is None:
-        found = guided_median_numpy(inverse, weights, slopes, colors, chosen)
+        found = guided_median_numpy(inverse, weights, slopes, colors, chosen, reach, step, spatial)
     else:
         found = core.guided_median(
-            inverse, weights, slopes, colors, chosen.astype(np.uint8), reach=_STEPS * step, step=step,
-            spatial=_SPATIAL_PX * finer, steepest=float(_STEEPEST),
+            inverse, weights, slopes, colors, chosen.astype(np.uint8), reach=reach, step=step, spatial=spatial,
+            steepest=float(_STEEPEST),
         )  # fmt: skip
     return np.where(chosen, -np.log(found), log_depth)
 
@@ -94,8 +95,9 @@ def _slopes(inverse: Float32Array, weights: Float32Array) -> Float32Array:
 
 
 def guided_median_numpy(
-    values: Float32Array, weights: Float32Array, slopes: Float32Array, colors: Float32Array, chosen: BoolArray
-) -> Float32Array:
+    values: Float32Array, weights: Float32Array, slopes: Float32Array, colors: Float32Array, chosen: BoolArray,
+    reach: int, step: int, spatial: float,
+) -> Float32Array:  # fmt: skip
     """Do what ``cpp_factors/src/guided_median.cpp`` does.
 
     Args:
@@ -104,22 +106,21 @@ def guided_median_numpy(
         slopes: (h, w, 2) by what part values grow from a pixel to the one below and to the one on its right.
         colors: (h, w, 3) in units of sqrt(2) standard deviations of the weights by color.
         chosen: (h, w) pixels that take the median.
+        reach: Half side of the window, px, ...
+        step: ... of which one pixel in so many is looked at, along rows and columns.
+        spatial: Standard deviation of the weights by distance, px.
     """
     height, width = values.shape
     row, column = np.nonzero(chosen)
     color, weight, slope = colors.reshape(-1, 3), weights.ravel(), slopes.reshape(-1, 2)
     value, own = np.where(weights > 0, values, np.float32(0)).ravel(), color[row * width + column]
-    finer = times_finer(values.shape)
-    step = round(_STEP_PX * finer)
-    taps = range(-_STEPS * step, _STEPS * step + 1, step)
+    taps = range(-reach, reach + 1, step)
     around = np.empty((len(taps) ** 2, row.size), np.float32)
     weighed = np.empty_like(around)
     for number, (dy, dx) in enumerate((dy, dx) for dy in taps for dx in taps):
         inside = (row + dy >= 0) & (row + dy < height) & (column + dx >= 0) & (column + dx < width)
         at = np.where(inside, (row + dy) * width + column + dx, 0)
-        unlike = ((color[at] - own) ** 2).sum(axis=1) + np.float32(
-            (dy * dy + dx * dx) / (2 * (_SPATIAL_PX * finer) ** 2)
-        )
+        unlike = ((color[at] - own) ** 2).sum(axis=1) + np.float32((dy * dy + dx * dx) / (2 * spatial**2))
         back = -(np.float32(dy) * slope[at, 0] + np.float32(dx) * slope[at, 1])
         around[number] = value[at] * (1 + np.clip(back, -_STEEPEST, _STEEPEST))
         weighed[number] = np.where(inside, weight[at] * np.exp(-np.minimum(unlike, _FARTHEST)), np.float32(0))

@@ -11,7 +11,8 @@ from uni4d_fg.config.multiview import MultiviewConfig
 USUAL_SIDE = 320
 """Longer side, px, of the maps that lengths in working px are given for."""
 _HALF = 0.5
-_LARGEST_STEP = 255
+_LARGEST_SMALL_STEP, _LARGEST_STEP = 255, 1000
+"""Bounds of the fields: sums of costs along paths have 16 bits."""
 
 
 def matching_side(image_size: tuple[int, int], config: MultiviewConfig) -> int:
@@ -25,18 +26,17 @@ def times_finer(shape: tuple[int, ...]) -> float:
     return max(1.0, max(shape[:2]) / USUAL_SIDE)
 
 
-def settings_of_side(config: MultiviewConfig, longer_side: int) -> MultiviewConfig:
-    """Return settings that do for maps of a longer side, px, what the given ones do for the usual one.
+def finer_settings(config: MultiviewConfig, finer: float) -> MultiviewConfig:
+    """Return settings that do for maps so many times as fine as usual what the given ones do for the usual ones.
 
     A pixel is the mean of fewer pixels of the image, so that its noise is larger; and a window of as many pixels shows
     less of the scene, on the way through which a surface without texture has more of them to be wrong in.
     """
-    finer = times_finer((longer_side,))
     return config.model_copy(
         update={
             "image_noise": finer * config.image_noise,
-            "small_step_penalty": min(round(finer**2 * config.small_step_penalty), _LARGEST_STEP),
-            "large_step_penalty": round(finer**2 * config.large_step_penalty),
+            "small_step_penalty": min(round(finer**2 * config.small_step_penalty), _LARGEST_SMALL_STEP),
+            "large_step_penalty": min(round(finer**2 * config.large_step_penalty), _LARGEST_STEP),
             "mask_band_px": round(finer * config.mask_band_px),
         }
     )

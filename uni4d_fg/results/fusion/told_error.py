@@ -24,8 +24,8 @@ from uni4d_fg.results.fusion.matching_size import times_finer
 _WEIGHTS = np.array([-2.2, 0.554, 3.029, 0.499, -2.556], dtype=np.float32)
 _MANY_FRAMES = 4
 _PLAIN, _PLAINER = np.float32(0.008), 2
-"""Gray values that vary by less than this (of 1) are plain, and the power: fitted to a room, a street, and a table
-before a plain wall."""
+"""Gray values that vary by less than this (of 1, at the usual working size) are plain, and the power: fitted to a room,
+a street, and a table before a plain wall."""
 _EDGE_WINDOW = np.ones((5, 5), np.uint8)
 _STEEPEST = np.float32(0.3)
 _UNBENT, _BENT_WEIGHT = np.float32(1.0), np.float32(-2.2)
