@@ -227,6 +227,8 @@ class DenseMaps:
         averaged = averaged._replace(log_depth=self.size.continued(averaged.log_depth))
         sure = final_confidence(mine.depth.confidence, averaged, bleeds=self.bleeding_px > 0)
         sure *= probability_right(np.float32(self.common_sigma(frame)))
+        if self.is_interpolated and frame in self.matched:
+            sure = without_texture(sure, self.multiview.gray(frame), self.config.multiview.window_radius_px)
         filled, moving, unmasked = averaged.log_depth, mask, mine.unmasked
         if self.prefers_matching and self.is_interpolated:
             filled = smoothed_where_unsure(filled, np.where(unmasked, sure, np.float32(0)), mine.color)
@@ -249,9 +251,6 @@ class DenseMaps:
             full = lifted(filled, self.size.continued(mine.log_cue), given, self.size)
         if (moving > 0).any():
             full[moving > 0] = np.exp(self._moving(frame, given, moving)[moving > 0])
-        if self.is_interpolated and frame in self.matched:
-            gray = self.size.shown(self.multiview.gray(frame))
-            sure = without_texture(sure, gray, self.config.multiview.window_radius_px)
         return full, FinalStatic(log_depth, sure, self.size.shown(unmasked))
 
     def common_sigma(self, frame: int) -> float:

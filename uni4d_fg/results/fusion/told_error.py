@@ -72,8 +72,9 @@ def final_confidence(alone: Float32Array, averaged: Averaged, *, bleeds: bool = 
 def without_texture(sure: Float32Array, gray: Float32Array, radius: int) -> Float32Array:
     """Return probabilities (h, w) that are less where the image is plain, for depth that nothing else tells.
 
-    What borders on a plain surface carries its depth over to it, in all frames alike, so that these agree. The odds
-    fall with a power of what gray values vary by in the window that was compared.
+    What borders on a plain surface carries its depth over to it, in all frames alike, so that these agree: also where
+    the window that was compared lies across the border, as its texture is then the other surface's. The odds fall with
+    a power of what gray values vary by in the plainest window that holds the pixel.
 
     Args:
         sure: (h, w).
@@ -86,7 +87,8 @@ def without_texture(sure: Float32Array, gray: Float32Array, radius: int) -> Floa
     value = np.where(known, gray, np.float32(0))
     share = np.maximum(cv2.blur(known.astype(np.float32), window), np.float32(1e-6))
     mean, square = (cv2.blur(part, window) / share for part in (value, value * value))
-    varies = np.sqrt(np.maximum(square - mean * mean, 0))
+    varies = np.where(share > np.float32(1e-6), np.sqrt(np.maximum(square - mean * mean, 0)), np.float32(1))
+    varies = cv2.erode(varies, np.ones(window, np.uint8))
     odds = np.minimum(varies / np.float32(finer * _PLAIN), np.float32(1)) ** _PLAINER
     return np.asarray(sure * odds / (1 - sure + sure * odds + np.float32(1e-9)), np.float32)
 
