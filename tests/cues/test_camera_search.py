@@ -12,8 +12,11 @@ from cues.camera_scenes import FRAMES, path_error, ramp, structure, through
 from cues.start_scenes import GUESS, SIZE, K, forward, sideways, tracked
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.config.models import Config
 from uni4d_fg.cues.pixel_grid import PixelGrid
-from uni4d_fg.cues.structure import camera_search, motion
+from uni4d_fg.cues.start_doubts import start_doubts
+from uni4d_fg.cues.structure import camera_search, motion, zoom_search
+from uni4d_fg.cues.structure.camera_fit import Fitted
 from uni4d_fg.cues.structure.camera_search import FoundCamera, is_lens
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import structure_from_motion
@@ -86,6 +89,47 @@ def test_a_weak_lens_must_gain_more_than_errors_of_a_tracker(k1: float, gain: fl
     """Pixels move by 2.3 px at most through k1 = 0.02, and by 18 px, a twentieth of the width, through -0.12."""
     camera = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
     assert is_lens(camera, SIZE, gain, load_config("default", [])) is is_one
+
+
+@pytest.mark.parametrize(("k1", "is_one"), [(-0.2, True), (0.15, True), (0.2, False), (-1.6, False)])
+def test_no_lens_moves_pixels_far_outward(k1: float, is_one: bool) -> None:
+    """Through 0.15 they move by 4.4 % of the width at most, through 0.2 by 5.6 %."""
+    camera = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
+    assert is_lens(camera, SIZE, 0.5, load_config("default", [])) is is_one
+
+
+def test_distortion_that_no_lens_has_is_not_taken_and_told() -> None:
+    lens = Lens("SIMPLE_RADIAL", (0.3,))
+    found = structure(through(tracked(sideways(FRAMES), points=1500), CameraModel(K, lens)))
+    assert found.camera.lens.is_pinhole
+    assert found.denied_px == pytest.approx(lens.displacement(K, SIZE), rel=0.2)
+    (doubt,) = (line for line in start_doubts(found) if "no lens has" in line)
+    assert f"by up to {found.denied_px:.0f} px" in doubt
+    plain = structure(tracked(sideways(FRAMES)))
+    assert plain.denied_px == 0.0
+    assert not any("no lens has" in line for line in start_doubts(plain))
+
+
+@pytest.mark.slow
+def test_a_zoom_that_explains_less_with_each_round_is_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounds go on from the tracks that agree with the one before, which may be ever fewer."""
+    fit, ends = zoom_search.fit_zoom, list[float]()
+
+    def spoiled(start: Fitted, config: Config, options: dict[str, float], *, settled: bool = False) -> Fitted:
+        found = fit(start, config, options, settled=settled)
+        assert found.camera.zoom is not None
+        if start.evidence in ends:
+            found = replace(found, camera=replace(found.camera, zoom=found.camera.zoom**1.2))
+        if options.get("max_iterations") == zoom_search._STEPS:
+            ends.append(found.evidence)
+        return found
+
+    monkeypatch.setattr(zoom_search, "fit_zoom", spoiled)
+    scene = through(tracked(sideways(FRAMES), points=1500), CameraModel(K, zoom=ramp(1.6)))
+    found = structure(scene)
+    assert len(ends) > 1
+    assert found.camera.zoom is not None
+    np.testing.assert_allclose(found.intrinsics[0] * found.camera.zoom, K[0] * ramp(1.6), rtol=0.03)
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,12 @@ class CameraConfig(Section):
         lt=1,
     )
     min_displacement_px: float = setting(1.0, "Distance by which it must move some pixel of the image, px.", ge=0)
+    max_pincushion: float = setting(
+        0.05,
+        "Part of the longer image side by which a lens moves a pixel outward at most: more makes up for something "
+        "else. (Tele lenses move the corners by 0.01, and wide ones move them inward.)",
+        gt=0,
+    )
     sure_displacement: float = setting(
         0.02, "Part of the longer image side below which that distance needs a gain on held-out tracks too.", ge=0, le=1
     )

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray
-from uni4d_fg.cues.start_limits import MUCH_UNEXPLAINED, OPEN_FOCAL, RIVAL_DEGREES, RIVAL_DEGREES_PER_FRAME
+from uni4d_fg.cues.start_limits import (
+    LITTLE_PARALLAX,
+    MUCH_UNEXPLAINED,
+    OPEN_FOCAL,
+    RIVAL_DEGREES,
+    RIVAL_DEGREES_PER_FRAME,
+)
 from uni4d_fg.cues.structure.motion import Structure
 from uni4d_fg.cues.structure.rivals import rotation_difference
 from uni4d_fg.frontend.sequence.problems import some_of
@@ -32,7 +38,8 @@ def start_doubts(structure: Structure, remedy: str = "give K.npy if it is known"
             f"{len(bridged)} frame(s) see too few points of the static scene, and their cameras are only interpolated"
             f"{' (most of the video: do not trust this result)' if severe else ''}: {some_of(bridged)}"
         )
-    return warnings + _open_focal(structure, remedy) + _doubtful_start(structure)
+    warnings += _open_focal(structure, remedy) + _denied_lens(structure, remedy) + _little_parallax(structure)
+    return warnings + _doubtful_start(structure)
 
 
 def doubts_of_masks(before: FloatArray, after: FloatArray) -> list[str]:
@@ -62,6 +69,24 @@ def _open_focal(structure: Structure, remedy: str) -> list[str]:
         f"this video leaves the focal length open: {focal:.0f} px was found, but from {low} to {high} explain the "
         f"tracks as well; depth, and motion along the viewing direction, stretch with it ({100 * below:+.0f} to "
         f"{100 * above:+.0f} %); {remedy}"
+    ]
+
+
+def _denied_lens(structure: Structure, remedy: str) -> list[str]:
+    if structure.denied_px == 0.0:
+        return []
+    return [
+        f"the tracks ask for distortion that no lens has (by up to {structure.denied_px:.0f} px): the cameras, which "
+        f"do without it, may be wrong, as where tracks are bad or the camera hardly moves; {remedy}"
+    ]
+
+
+def _little_parallax(structure: Structure) -> list[str]:
+    if structure.parallax_px >= LITTLE_PARALLAX * structure.sigma_px:
+        return []
+    return [
+        f"the camera hardly moves for what it sees: the tracks' median parallax is {structure.parallax_px:.1f} px, and "
+        f"their noise {structure.sigma_px:.2f} px; its turns are found, but its path and depth may be poor"
     ]
 
 
@@ -97,6 +122,8 @@ def start_summary(structure: Structure) -> dict[str, Any]:
         "focal_interval_px": [structure.focal.low, structure.focal.high],
         "focal_is_open": [structure.focal.low_is_open, structure.focal.high_is_open],
         "stretch_along_view": [1.0 + below, 1.0 + above],
+        "parallax_px": structure.parallax_px,
+        "noise_px": structure.sigma_px,
         "unexplained": structure.unexplained,
         "registered": float(np.mean(structure.registered)),
         "starts": [asdict(rival) for rival in structure.rivals],

@@ -8,5 +8,7 @@ RIVAL_DEGREES = 5.0
 """Cameras of another start that are turned by more than this against the result are warned of, ..."""
 RIVAL_DEGREES_PER_FRAME = 0.5
 """... and those whose turns from frame to frame differ by more than this."""
+LITTLE_PARALLAX = 30.0
+"""Parallax of the median track of less than this, in standard deviations of the tracks' noise, is warned of."""
 MUCH_UNEXPLAINED = 0.6
 """More than this part of what was held out is warned of."""

@@ -60,6 +60,8 @@ class FoundCamera:
     """Part of the reprojection energy that a lens takes away, if one was looked for."""
     open_focal: tuple[float, ...] = ()
     """Shortest and longest focal length, px, of a zoom that explains all tracks better, but not most of them."""
+    denied_px: float = 0.0
+    """How far distortion that explains the tracks better, but that no lens has, moves a pixel at most."""
 
 
 def find_camera(
@@ -100,12 +102,14 @@ def find_camera(
     if proposed is None and similar is None and not asks_for_lens:
         return None
     judge = TrackJudge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
-    best, gain, open_focal = plain, 0.0, tuple[float, ...]()
+    best, gain, open_focal, denied_px = plain, 0.0, tuple[float, ...](), 0.0
     if asks_for_lens:
         lens = _find_lens(plain, judge, config)
         gain = judge.better(lens, plain)[0]
         if is_lens(lens.camera, image_size, gain, config) and halves_agree_on_lens(lens, image_size, config):
             best = lens
+        elif lens_strength(lens.camera, image_size, config) is Strength.BEYOND and gain >= settings.min_evidence_unsure:
+            denied_px = lens.camera.lens.displacement(lens.camera.intrinsics, image_size)
     if proposed is not None or similar is not None:
         zoom = find_zoom(proposed, similar, plain, judge, scene, real, config, grown)
         if zoom is not None and settings.zoom == "on":
@@ -115,7 +119,9 @@ def find_camera(
                 best = zoom
             else:
                 open_focal = focal_range(zoom)
-    return None if best is plain and not open_focal else FoundCamera(best.camera, gain, open_focal)
+    if best is plain and not open_focal and denied_px == 0.0:
+        return None
+    return FoundCamera(best.camera, gain, open_focal, denied_px if best is plain else 0.0)
 
 
 def needs_zoom(scene: GrowingScene, config: Config, blur_px: Float32Array | None = None) -> bool:
@@ -139,7 +145,7 @@ def lens_strength(camera: CameraModel, image_size: tuple[int, int], config: Conf
 def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, config: Config) -> bool:
     """Tell whether a lens bends the image enough, for what it gains: errors of a tracker mimic a weak one."""
     strength = lens_strength(camera, image_size, config)
-    if strength is Strength.NO_LENS:
+    if strength in (Strength.NO_LENS, Strength.BEYOND):
         return False
     return gain >= config.camera.min_evidence_unsure if strength is Strength.WEAK else gain > 0.0
 

@@ -100,11 +100,19 @@ class Structure:
     readout: Readout | None = None
     """How images are read, in units of the time between two; None where all rows are read at once. Cameras and points
     are then those of the middle rows."""
+    denied_px: float = 0.0
+    """How far distortion that explains the tracks better, but that no lens has, moves a pixel at most; 0 without."""
 
     @property
     def intrinsics(self) -> FloatArray:
         """(4,) px."""
         return self.camera.intrinsics
+
+    @property
+    def parallax_px(self) -> float:
+        """By how much the median track shows its point from other sides, px at the middle of the image; 0 without."""
+        angle = self.points.angle[np.isfinite(self.points.position[:, 0])]
+        return float(np.median(angle) * np.mean(self.intrinsics[:2])) if len(angle) else 0.0
 
 
 def observations_of_tracks(tracks: Tracks, which: BoolArray) -> Observations:
@@ -172,7 +180,7 @@ def structure_from_motion(
     if grown is None:
         return None
     beside: list[float] = []  # focal lengths, px, of cameras that explain the tracks nearly as well
-    readout = None
+    readout, denied_px = None, 0.0
     if any_camera and free_focal and camera.is_plain:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
@@ -188,6 +196,7 @@ def structure_from_motion(
         reporter.end()
         if found is not None:
             beside += found.open_focal
+            denied_px = found.denied_px
         if found is not None and not found.camera.is_plain:
             ideal = found.camera.ideal_observations(observations)
             again = search.grow(ideal, found.camera.intrinsics, free_focal)
@@ -232,7 +241,7 @@ def structure_from_motion(
     reporter.end()
     return Structure(
         poses, camera.with_intrinsics(scene.intrinsics), scene.registered, track, points, moving, stray, sigma,
-        best.pair, focal, focal_sigma, best.unexplained, rivals, readout,
+        best.pair, focal, focal_sigma, best.unexplained, rivals, readout, denied_px,
     )  # fmt: skip
 
 

@@ -132,7 +132,10 @@ def find_zoom(
     for _ in range(1, _ROUNDS):
         if config.camera.zoom == "auto" and judge.better(best, plain)[1] < 0.5:
             return None
-        before, best = best, judge.anew(fit_zoom(best, config, to_the_end))
+        again = judge.anew(fit_zoom(best, config, to_the_end))
+        if judge.cost(again) > (1.0 + _TIE) * judge.cost(best):
+            break  # Tracks that agree with it are chosen anew each time: few of them may lead away from the others.
+        before, best = best, again
         if float(np.ptp(_log_zoom(best) - _log_zoom(before))) < _SETTLED:
             break
     return best

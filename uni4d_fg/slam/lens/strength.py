@@ -10,14 +10,16 @@ from uni4d_fg.config.camera import CameraConfig
 from uni4d_fg.geometry.lens import Lens
 
 _FAR = 3.0
-"""A parameter that is farther from zero than so many sigmas of its prior is no lens: it makes up for what moves."""
+"""A parameter that is farther from zero than so many sigmas of its prior is that of no lens."""
 
 
 class Strength(Enum):
     """Of distortion that was fitted."""
 
     NO_LENS = "no lens"
-    """It hardly moves a pixel, or farther than lenses do."""
+    """It hardly moves a pixel."""
+    BEYOND = "beyond lenses"
+    """It moves pixels farther than lenses do: it makes up for something else."""
     WEAK = "weak"
     """Errors of a tracker, or of a depth cue, mimic as much."""
     SURE = "sure"
@@ -32,8 +34,11 @@ def strength_of(lens: Lens, displacement_px: float, image_size: tuple[int, int],
         image_size: (height, width), px.
         settings: Limits.
     """
-    if max(map(abs, lens.parameters), default=0.0) > _FAR * settings.parameter_prior_sigma:
+    if displacement_px <= settings.min_displacement_px:
         return Strength.NO_LENS
-    if not settings.min_displacement_px < displacement_px < np.inf:
-        return Strength.NO_LENS
-    return Strength.WEAK if displacement_px < settings.sure_displacement * max(image_size) else Strength.SURE
+    part = displacement_px / max(image_size)
+    is_far = max(map(abs, lens.parameters)) > _FAR * settings.parameter_prior_sigma
+    is_pincushion = lens.parameters[0] > 0.0
+    if is_far or not np.isfinite(part) or (is_pincushion and part > settings.max_pincushion):
+        return Strength.BEYOND
+    return Strength.WEAK if part < settings.sure_displacement else Strength.SURE
