@@ -35,5 +35,7 @@ def test_little_parallax_is_told(found: Structure) -> None:
     (doubt,) = start_doubts(replace(found, sigma_px=found.parallax_px / 29.0))
     assert f"median parallax is {found.parallax_px:.1f} px" in doubt
     assert start_doubts(replace(found, sigma_px=found.parallax_px / 31.0)) == []
+    (doubt,) = start_doubts(replace(found, denied_px=float("inf")))
+    assert "distortion that no lens has: the cameras" in doubt
     summary = start_summary(found)
     assert (summary["parallax_px"], summary["noise_px"]) == (found.parallax_px, found.sigma_px)

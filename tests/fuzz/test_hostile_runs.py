@@ -67,6 +67,8 @@ START = {
     "focal_interval_px": [60.0, 95.0],
     "focal_is_open": [True, False],
     "stretch_along_view": [0.8, 1.3],
+    "parallax_px": 40.0,
+    "noise_px": 0.3,
     "unexplained": 0.25,
     "registered": 1.0,
     "starts": [RIVAL, {**RIVAL, "first": 1}],
@@ -140,7 +142,7 @@ def test_a_summary_of_other_types_is_refused(run_folder: Path, tmp_path: Path, c
 
 
 SOLVE = {"name": "a", "initial_energy": 2.0, "final_energy": 1.0, "energy_curve": [[1, 1.0]], "num_factors": 3}
-NOTHING_KNOWN = {name: None for name in ("focal_px", "unexplained")} | {
+NOTHING_KNOWN = {name: None for name in ("focal_px", "parallax_px", "noise_px", "unexplained")} | {
     "focal_interval_px": [None, None],
     "stretch_along_view": [None, None],
     "starts": [{"first": 1, "second": 2, "degrees": None, "degrees_per_frame": None, "unexplained": None}],
@@ -163,6 +165,7 @@ NOTHING_KNOWN = {name: None for name in ("focal_px", "unexplained")} | {
         {"cues": {"seconds": 1.7e308, "start": START}},
         {"cues": {"start": NOTHING_KNOWN}},
         {"cues": {"start": {**START, "focal_px": 5e-324, "unexplained": -1e308}}},
+        {"cues": {"start": {**START, "parallax_px": 1.7e308, "noise_px": -1e308}}},
         {"cues": {"start": {}}},
     ],
 )

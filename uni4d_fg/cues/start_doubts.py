@@ -75,9 +75,10 @@ def _open_focal(structure: Structure, remedy: str) -> list[str]:
 def _denied_lens(structure: Structure, remedy: str) -> list[str]:
     if structure.denied_px == 0.0:
         return []
+    by = f" (by up to {structure.denied_px:.0f} px)" if np.isfinite(structure.denied_px) else ""
     return [
-        f"the tracks ask for distortion that no lens has (by up to {structure.denied_px:.0f} px): the cameras, which "
-        f"do without it, may be wrong, as where tracks are bad or the camera hardly moves; {remedy}"
+        f"the tracks ask for distortion that no lens has{by}: the cameras, which do without it, may be wrong, as where "
+        f"tracks are bad or the camera hardly moves; {remedy}"
     ]
 
 

@@ -72,6 +72,8 @@ class _Start(_Part):
     focal_interval_px: Annotated[list[Positive | None], Field(min_length=2, max_length=2)] = [None, None]
     focal_is_open: Annotated[list[bool], Field(min_length=2, max_length=2)] = [False, False]
     stretch_along_view: Annotated[list[Number | None], Field(min_length=2, max_length=2)] = [None, None]
+    parallax_px: Number | None = None
+    noise_px: Number | None = None
     unexplained: Number | None = None
     starts: list[_Rival] = []
 

@@ -111,6 +111,10 @@ def test_the_quality_of_depth_is_said(run: Run) -> None:
 def test_what_motion_leaves_open_is_said(run: Run) -> None:
     narrow = certainty(with_start(run, focal_px=500.0, focal_interval_px=[495.0, 506.0], focal_is_open=[False, False]))
     assert "fixes the focal length at 500 px: outside of 495 to 506 px" in narrow
+    assert "sides that are" not in narrow
+    for parallax, verdict in ((8.9, "that is little"), (9.1, "enough to tell its path")):
+        told = certainty(with_start(run, parallax_px=parallax, noise_px=0.3))
+        assert f"from sides that are {parallax} px apart in the image, beside 0.30 px of noise ({verdict}" in told
     wide = certainty(
         with_start(
             run,

@@ -145,7 +145,7 @@ def lens_strength(camera: CameraModel, image_size: tuple[int, int], config: Conf
 def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, config: Config) -> bool:
     """Tell whether a lens bends the image enough, for what it gains: errors of a tracker mimic a weak one."""
     strength = lens_strength(camera, image_size, config)
-    if strength in (Strength.NO_LENS, Strength.BEYOND):
+    if not strength.is_lens:
         return False
     return gain >= config.camera.min_evidence_unsure if strength is Strength.WEAK else gain > 0.0
 

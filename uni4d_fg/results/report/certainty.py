@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from uni4d_fg.counted import counted
-from uni4d_fg.cues.start_limits import MUCH_UNEXPLAINED, OPEN_FOCAL, RIVAL_DEGREES
+from uni4d_fg.cues.start_limits import LITTLE_PARALLAX, MUCH_UNEXPLAINED, OPEN_FOCAL, RIVAL_DEGREES
 from uni4d_fg.results.measures import pose_sigmas, scene_depth
 from uni4d_fg.results.report.markup import Markup, bullets, fold, number, section, table
 from uni4d_fg.results.run import Run
@@ -59,6 +59,14 @@ def _start(run: Run) -> Iterator[str]:
                 f"Motion alone fixes the focal length at {focal:.0f} px: outside of {low:.0f} to {high:.0f} px the "
                 "tracks fit worse."
             )
+    parallax, noise = start.get("parallax_px"), start.get("noise_px")
+    if parallax is not None and noise is not None:
+        is_little = parallax < LITTLE_PARALLAX * noise
+        verdict = "that is little: path and depth may be poor" if is_little else "enough to tell its path"
+        yield (
+            f"The camera's motion shows the median track's point from sides that are {parallax:.1f} px apart in the "
+            f"image, beside {noise:.2f} px of noise ({verdict})."
+        )
     unexplained = start.get("unexplained")
     if unexplained is not None:
         verdict = "that is little: much may move, or tracks are bad" if unexplained > MUCH_UNEXPLAINED else "as usual"

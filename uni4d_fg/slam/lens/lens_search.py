@@ -149,7 +149,7 @@ def is_taken(
     if candidate.evidence < enough and not by_cue:
         return False
     strength = strength_of(candidate.lens, candidate.displacement_px, image_size, settings)
-    if strength in (Strength.NO_LENS, Strength.BEYOND):
+    if not strength.is_lens:
         return False
     weak, little = strength is Strength.WEAK, candidate.evidence < settings.min_evidence_unsure
     if weak and little and not after_another:

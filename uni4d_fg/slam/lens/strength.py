@@ -24,6 +24,11 @@ class Strength(Enum):
     """Errors of a tracker, or of a depth cue, mimic as much."""
     SURE = "sure"
 
+    @property
+    def is_lens(self) -> bool:
+        """Whether a lens may do this."""
+        return self in (Strength.WEAK, Strength.SURE)
+
 
 def strength_of(lens: Lens, displacement_px: float, image_size: tuple[int, int], settings: CameraConfig) -> Strength:
     """Return how strong a lens is.
