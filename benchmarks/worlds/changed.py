@@ -23,14 +23,15 @@ from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.gather import gather_cues
 from uni4d_fg.cues.plan import plan_cues
+from uni4d_fg.cues.scale_notes import NOT_METRIC
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
 
 _K1 = -0.15
 _LAST_ZOOM = 1.5
-_THINGS = "the depth of moving thing"
-"""So begin warnings that are not of the cameras."""
+_NOT_OF_CAMERAS = ("the depth of moving thing", NOT_METRIC)
+"""So begin other warnings."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def run(clip: Clip, folder: Path) -> str:
     metrics = evaluate_trajectory(poses, clip.world_T_cam)
     extent = float(np.linalg.norm(np.ptp(clip.world_T_cam[:, :3, 3], axis=0)))
     focal = found.intrinsics[0] * (np.ones(len(poses)) if found.zoom is None else found.zoom) / clip.focal - 1
-    doubts = [line for line in report.warnings if not line.startswith(_THINGS)]
+    doubts = [line for line in report.warnings if not line.startswith(_NOT_OF_CAMERAS)]
     kinds = [[word in line for line in doubts] for word in ("focal length open", "ambiguous")]
     other = len(doubts) - sum(map(sum, kinds))
     model = found.lens.model + "".join(f" {found.lens.parameters[0]:+.3f}" for _ in found.lens.parameters[:1])

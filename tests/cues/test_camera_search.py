@@ -110,6 +110,14 @@ def test_distortion_that_no_lens_has_is_not_taken_and_told() -> None:
     assert not any("no lens has" in line for line in start_doubts(plain))
 
 
+def test_a_lens_that_parts_of_a_video_contradict_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera_search, "halves_agree_on_lens", lambda *_: False)
+    lens = Lens("SIMPLE_RADIAL", (-0.2,))
+    found = structure(through(tracked(sideways(FRAMES), points=1500), CameraModel(K, lens)))
+    assert found.camera.lens.is_pinhole
+    assert found.denied_px == pytest.approx(lens.displacement(K, SIZE), rel=0.2)
+
+
 @pytest.mark.slow
 def test_a_zoom_that_explains_less_with_each_round_is_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounds go on from the tracks that agree with the one before, which may be ever fewer."""

@@ -46,6 +46,9 @@ k2 of 0.03 beside k1 of -0.1 takes 0.5 to 3.6 %."""
 _LENS_ROUNDS = 4
 _LENS_STAYS = 0.003
 """Change of k1 in a round below which it is found."""
+_MUCH = 0.1
+"""Part of the energy that a lens must take away to be told of where halves of the tracks disagree on it; errors of a
+tracker take away up to 0.03."""
 _HOPELESS = 0.2
 """Part by which a lens has more energy than a rival, after a round, at which no other round follows: a scene with near
 and far exchanged that took over had 0.15 less from the first round on, one that did not had 0.66 more."""
@@ -61,7 +64,7 @@ class FoundCamera:
     open_focal: tuple[float, ...] = ()
     """Shortest and longest focal length, px, of a zoom that explains all tracks better, but not most of them."""
     denied_px: float = 0.0
-    """How far distortion that explains the tracks better, but that no lens has, moves a pixel at most."""
+    """How far distortion that explains the tracks better, but that is no lens in all of them, moves a pixel at most."""
 
 
 def find_camera(
@@ -106,9 +109,10 @@ def find_camera(
     if asks_for_lens:
         lens = _find_lens(plain, judge, config)
         gain = judge.better(lens, plain)[0]
+        is_beyond = lens_strength(lens.camera, image_size, config) is Strength.BEYOND
         if is_lens(lens.camera, image_size, gain, config) and halves_agree_on_lens(lens, image_size, config):
             best = lens
-        elif lens_strength(lens.camera, image_size, config) is Strength.BEYOND and gain >= settings.min_evidence_unsure:
+        elif gain >= (settings.min_evidence_unsure if is_beyond else _MUCH):
             denied_px = lens.camera.lens.displacement(lens.camera.intrinsics, image_size)
     if proposed is not None or similar is not None:
         zoom = find_zoom(proposed, similar, plain, judge, scene, real, config, grown)
