@@ -123,7 +123,7 @@ def run(clip: Clip, folder: Path) -> str:
     doubts = [line for line in report.warnings if not line.startswith(_NOT_OF_CAMERAS)]
     kinds = [[word in line for line in doubts] for word in ("focal length open", "ambiguous")]
     other = len(doubts) - sum(map(sum, kinds))
-    model = found.lens.model + "".join(f" {found.lens.parameters[0]:+.3f}" for _ in found.lens.parameters[:1])
+    model = found.lens.model + "".join(f" {k1:+.3f}" for k1 in found.lens.parameters[:1])
     told = [name for name, is_so in zip(("open", "ambiguous"), map(any, kinds), strict=True) if is_so]
     return (
         f"{metrics.ate_m / extent:.4f} | {metrics.rpe_rotation_deg or 0.0:.3f} | {focal.mean():+.3f} | "

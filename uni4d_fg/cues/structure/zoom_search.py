@@ -134,14 +134,16 @@ def find_zoom(
     cost_of = {number: judge.cost(end) for number, end in ends.items()}
     tied = [number for number in close if cost_of[number] <= (1.0 + _TIE) * min(cost_of.values())]
     # Cameras that were grown anew owe nothing to the plain ones, which are wrong: in a tie they are taken.
-    best = ends[min(tied, key=lambda number: (number < at_hand, cost_of[number]))]
+    first = min(tied, key=lambda number: (number < at_hand, cost_of[number]))
+    best, cost = ends[first], cost_of[first]
     for _ in range(1, _ROUNDS):
         if config.camera.zoom == "auto" and judge.better(best, plain)[1] < 0.5:
             return None
         again = judge.anew(fit_zoom(best, config, to_the_end))
-        if judge.cost(again) > (1.0 + _LEADS_AWAY) * judge.cost(best):
+        cost_again = judge.cost(again)
+        if cost_again > (1.0 + _LEADS_AWAY) * cost:
             break
-        before, best = best, again
+        before, best, cost = best, again, cost_again
         if float(np.ptp(_log_zoom(best) - _log_zoom(before))) < _SETTLED:
             break
     return best
