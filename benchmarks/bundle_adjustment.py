@@ -117,7 +117,7 @@ def adjustment(state: State, frame: IntArray, row: IntArray, uv: FloatArray) -> 
         INTRINSICS: np.ones((1, 4), dtype=bool),
     }
     free[POSE][[0, -1]] = False
-    return Problem((batch,), free)
+    return Problem((batch,), free).eliminate(LANDMARK)
 
 
 def solve_ours(problem: Problem, state: State, threads: int, cpp: bool) -> dict[str, float]:

@@ -2,6 +2,9 @@
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
+#include <numeric>
+
 #include "arrays.hpp"
 #include "uni4d_fg/parallel.hpp"
 
@@ -87,20 +90,20 @@ double robust_energy(const AnyArray& residual, const AnyArray& sigma, const AnyA
   if (dim < 1 || dim > 16) refuse("residual: expected 1 to 16 columns, got " + std::to_string(dim));
   const Noise noise = expect_noise(sigma, weight, kernel, threshold, r.rows(), dim);
   const int workers = useful_threads(expect_threads(threads), count, kGrain);
-  std::vector<double> partial(static_cast<std::size_t>(workers), 0.0);
+  // Ranges of fixed length, added in order: the sum does not depend on the number of threads.
+  std::vector<double> partial(static_cast<std::size_t>(count / kGrain + 1), 0.0);
   {
     nb::gil_scoped_release release;
-    parallel_for(count, workers, [&](int begin, int end, int worker) {
-      double inverse_sigma[16], white[16], sum = 0.0;
-      for (long row = begin; row < end; ++row)
-        sum += noise.weight.data[row] *
-               rho(noise.kernel, whiten_row(r.data + row * dim, noise, row, dim, inverse_sigma, white));
-      partial[static_cast<std::size_t>(worker)] = sum;
+    parallel_for(static_cast<int>(partial.size()), workers, [&](int first, int last, int) {
+      double inverse_sigma[16], white[16];
+      for (int range = first; range < last; ++range)
+        for (long row = long{range} * kGrain; row < std::min<long>(count, (range + 1L) * kGrain); ++row)
+          partial[static_cast<std::size_t>(range)] +=
+              noise.weight.data[row] *
+              rho(noise.kernel, whiten_row(r.data + row * dim, noise, row, dim, inverse_sigma, white));
     });
   }
-  double total = 0.0;
-  for (const double sum : partial) total += sum;
-  return total;
+  return std::accumulate(partial.begin(), partial.end(), 0.0);
 }
 
 }  // namespace

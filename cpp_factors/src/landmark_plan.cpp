@@ -1,7 +1,6 @@
 #include "uni4d_fg/landmark_plan.hpp"
 
 #include <algorithm>
-#include <limits>
 #include <numeric>
 
 #include "uni4d_fg/parallel.hpp"
@@ -10,7 +9,8 @@ namespace uni4d_fg {
 
 namespace {
 
-constexpr int kRecordsPerWorker = 2000;
+/// More parts keep more threads busy, and take more memory and time to add up.
+constexpr std::size_t kRecordsPerPart = 2000, kMostParts = 8;
 
 /// One factor, as a number by which factors of a chunk are sorted: by frame, then landmark, then order of being given.
 ///     (frame * 64 + place of the landmark in its chunk) << 32 | number of the factor over all batches
@@ -220,25 +220,25 @@ void fill_chunk(const FactorNumbers& numbers, std::vector<Entry>::const_iterator
     for (const int n : seen_by) chunk.cost += 0.5 * n * (n + 1) + 2.0 * n + 4.0;
 }
 
-/// Cut the chunks into ranges of about equal cost, one per worker: (workers + 1) first chunks.
-std::vector<int> balance(const std::vector<LandmarkChunk>& chunks, int threads) {
+/// Cut the chunks into ranges of about equal cost: (parts + 1) first chunks.
+std::vector<int> cut_into_parts(const std::vector<LandmarkChunk>& chunks) {
   double total = 0.0;
   std::size_t groups = 0;
   for (const LandmarkChunk& chunk : chunks) {
     total += chunk.cost;
     groups += chunk.groups.size();
   }
-  const int most = static_cast<int>(std::min<std::size_t>(groups * kSimd8Width, std::numeric_limits<int>::max()));
-  const int workers =
-      std::max(1, std::min(useful_threads(threads, most, kRecordsPerWorker), static_cast<int>(chunks.size())));
+  const std::size_t wanted = std::min({groups * kSimd8Width / kRecordsPerPart, kMostParts, chunks.size()});
+  const std::size_t parts = std::max<std::size_t>(wanted, 1);
+  const double share = total / static_cast<double>(parts);
   std::vector<int> begin{0};
   double sum = 0.0;
   for (std::size_t i = 0; i < chunks.size(); ++i) {
-    while (static_cast<int>(begin.size()) < workers && sum + 0.5 * chunks[i].cost >= total * begin.size() / workers)
+    while (begin.size() < parts && sum + 0.5 * chunks[i].cost >= share * static_cast<double>(begin.size()))
       begin.push_back(static_cast<int>(i));
     sum += chunks[i].cost;
   }
-  while (static_cast<int>(begin.size()) <= workers) begin.push_back(static_cast<int>(chunks.size()));
+  while (begin.size() <= parts) begin.push_back(static_cast<int>(chunks.size()));
   return begin;
 }
 
@@ -293,7 +293,7 @@ LandmarkPlan plan_landmarks(const LandmarkProblem& problem, int threads) {
     chunk.first_pair = plan.num_pairs;
     plan.num_pairs += chunk.num_pairs();
   }
-  plan.worker_begin = balance(plan.chunks, threads);
+  plan.part_begin = cut_into_parts(plan.chunks);
   return plan;
 }
 

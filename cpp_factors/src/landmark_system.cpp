@@ -49,43 +49,60 @@ LandmarkSystem::LandmarkSystem(LandmarkProblem problem, int threads)
   coupling_.resize(static_cast<std::size_t>(plan_.num_pairs) * kWidth);
   landmarks_.assign(static_cast<std::size_t>(problem_.num_landmarks) * kWidth, 0.0);
   factors_.resize(static_cast<std::size_t>(problem_.num_landmarks) * 6);
-  const auto count = static_cast<std::size_t>(workers());
-  const auto frames = static_cast<std::size_t>(problem_.num_frames);
-  frame_sums_.resize(count);
-  last_frame_.resize(count);
-  tile_begin_.resize(count);
-  tiles_.resize(count);
-  scratch_.resize(count);
-  scratch_place_.resize(count);
-  // Each worker sums the tiles of E V^{-1} E^T of its chunks: tile (i, j) of frames i <= j is needed if a landmark of
-  // these chunks is seen in both. Row i has tiles for j = i .. last_frame_[i], the first at tile_begin_[i]; behind all
-  // rows come one tile per frame for its border (intrinsics and gradient) and one for the border with itself.
-  for (std::size_t w = 0; w < count; ++w) {
-    frame_sums_[w].resize(frames * kSumWidth);
-    last_frame_[w].assign(frames, -1);
-    std::size_t most_pairs = 0, most_frames = 0;
-    for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1]; ++i) {
-      const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
-      if (chunk.frozen) continue;
-      most_pairs = std::max(most_pairs, chunk.pair_landmark.size());
-      most_frames = std::max(most_frames, chunk.frames.size());
-      for (std::size_t a = 0; a < chunk.frames.size(); ++a)
-        for (std::size_t b = chunk.frames.size(); b-- > a;)
-          if ((chunk.seen[a] & chunk.seen[b]) != 0) {
-            int& last = last_frame_[w][static_cast<std::size_t>(chunk.frames[a])];
-            last = std::max(last, chunk.frames[b]);
-            break;
-          }
-    }
-    check_storage(last_frame_[w]);
-    tile_begin_[w].assign(frames + 1, 0);
-    for (std::size_t f = 0; f < frames; ++f)
-      tile_begin_[w][f + 1] = tile_begin_[w][f] + std::max(last_frame_[w][f] - static_cast<int>(f) + 1, 0);
-    tiles_[w].resize((static_cast<std::size_t>(tile_begin_[w][frames]) + frames + 1) * kTile);
-    const std::size_t rows = poses_free_ ? most_pairs * kWidth : most_frames * landmark_passes::kScaleRow;
-    scratch_[w].resize(kChunkLandmarks * kWidth + rows);
-    scratch_place_[w].resize(most_frames * kChunkLandmarks);
+  for (int part = 0; part < plan_.num_parts(); ++part) parts_.push_back(make_part(part));
+  std::size_t most_pairs = 0, most_frames = 0;
+  for (const LandmarkChunk& chunk : plan_.chunks) {
+    if (chunk.frozen) continue;
+    most_pairs = std::max(most_pairs, chunk.pair_landmark.size());
+    most_frames = std::max(most_frames, chunk.frames.size());
   }
+  scratch_.resize(static_cast<std::size_t>(workers()));
+  for (Scratch& scratch : scratch_) {
+    scratch.border.resize(kChunkLandmarks * kWidth);
+    scratch.rows.resize(poses_free_ ? most_pairs * kWidth : most_frames * landmark_passes::kScaleRow);
+    scratch.place.resize(most_frames * kChunkLandmarks);
+  }
+}
+
+LandmarkSystem::Part LandmarkSystem::make_part(int index) const {
+  const auto frames = static_cast<std::size_t>(problem_.num_frames);
+  Part part;
+  part.frames_begin = problem_.num_frames;
+  part.last_frame.assign(frames, -1);
+  for_chunks(static_cast<std::size_t>(index), [&](const LandmarkChunk& chunk) {
+    if (chunk.frames.empty()) return;
+    part.frames_begin = std::min(part.frames_begin, chunk.frames.front());
+    part.frames_end = std::max(part.frames_end, chunk.frames.back() + 1);
+    if (chunk.frozen) return;
+    for (std::size_t a = 0; a < chunk.frames.size(); ++a)
+      for (std::size_t b = chunk.frames.size(); b-- > a;)
+        if ((chunk.seen[a] & chunk.seen[b]) != 0) {
+          int& last = part.last_frame[static_cast<std::size_t>(chunk.frames[a])];
+          last = std::max(last, chunk.frames[b]);
+          break;
+        }
+  });
+  check_storage(part.last_frame);
+  part.frames_begin = std::min(part.frames_begin, part.frames_end);
+  part.frame_sums.resize(static_cast<std::size_t>(part.frames_end - part.frames_begin) * kSumWidth);
+  part.tile_begin.assign(frames + 1, 0);
+  for (std::size_t f = 0; f < frames; ++f)
+    part.tile_begin[f + 1] = part.tile_begin[f] + std::max(part.last_frame[f] - static_cast<int>(f) + 1, 0);
+  part.tiles.resize((static_cast<std::size_t>(part.tile_begin[frames]) + frames + 1) * kTile);
+  return part;
+}
+
+template <typename F>
+void LandmarkSystem::for_parts(F f) const {
+  parallel_for(plan_.num_parts(), threads_, [&](int begin, int end, int worker) {
+    for (int part = begin; part < end; ++part) f(static_cast<std::size_t>(part), static_cast<std::size_t>(worker));
+  });
+}
+
+template <typename F>
+void LandmarkSystem::for_chunks(std::size_t part, F f) const {
+  for (int i = plan_.part_begin[part]; i < plan_.part_begin[part + 1]; ++i)
+    f(plan_.chunks[static_cast<std::size_t>(i)]);
 }
 
 void LandmarkSystem::check_storage(const std::vector<int>& last_frame) const {
@@ -104,20 +121,17 @@ void LandmarkSystem::check_storage(const std::vector<int>& last_frame) const {
 }
 
 void LandmarkSystem::energies(const LandmarkState& state, double* out) const {
-  const auto count = static_cast<std::size_t>(workers());
   const landmark_passes::PassInput in{state, reprojection_kernels_.data(), depth_kernels_.data()};
   const std::size_t reprojections = reprojection_kernels_.size(), depths = depth_kernels_.size();
-  std::vector<AlignedDoubles> sums(count, AlignedDoubles((reprojections + depths) * kSimd8Width, 0.0));
-  parallel_for(workers(), workers(), [&](int worker, int, int) {
-    const auto w = static_cast<std::size_t>(worker);
-    double* own = sums[w].data();
-    for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1]; ++i) {
-      const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
+  std::vector<AlignedDoubles> sums(parts_.size(), AlignedDoubles((reprojections + depths) * kSimd8Width, 0.0));
+  for_parts([&](std::size_t part, std::size_t) {
+    double* own = sums[part].data();
+    for_chunks(part, [&](const LandmarkChunk& chunk) {
       if (num_depth_ > 0)
         landmark_passes::energies_depth(in, chunk, own, own + reprojections * kSimd8Width);
       else
         landmark_passes::energies_plain(in, chunk, own);
-    }
+    });
   });
   for (int batch = 0; batch < num_batches(); ++batch) {
     const std::size_t place = batch < num_reprojection_
@@ -133,12 +147,10 @@ void LandmarkSystem::settle_landmarks(const LandmarkState& state, const DampingB
   std::copy_n(state.landmarks, 3 * static_cast<std::size_t>(problem_.num_landmarks), landmarks);
   const landmark_passes::PassInput in{state, reprojection_kernels_.data(), depth_kernels_.data()};
   const auto settle = num_depth_ > 0 ? landmark_passes::settle_points_with_depth : landmark_passes::settle_points;
-  parallel_for(workers(), workers(), [&](int worker, int, int) {
-    const auto w = static_cast<std::size_t>(worker);
-    for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1]; ++i) {
-      const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
+  for_parts([&](std::size_t part, std::size_t) {
+    for_chunks(part, [&](const LandmarkChunk& chunk) {
       if (!chunk.frozen) settle(in, chunk, bounds, iterations, landmarks);
-    }
+    });
   });
 }
 
@@ -149,15 +161,16 @@ LinearizeResult LandmarkSystem::linearize(const LandmarkState& state, const Came
       num_depth_ > 0
           ? (problem_.intrinsics_free ? landmark_passes::linearize_depth_intrinsics : landmark_passes::linearize_depth)
           : (problem_.intrinsics_free ? landmark_passes::linearize_intrinsics : landmark_passes::linearize_plain);
-  std::vector<LinearizeResult> results(static_cast<std::size_t>(workers()));
-  parallel_for(workers(), workers(), [&](int worker, int, int) {
-    const auto w = static_cast<std::size_t>(worker);
-    std::fill(frame_sums_[w].begin(), frame_sums_[w].end(), 0.0);
-    LinearizeResult& result = results[w];
-    for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1]; ++i) {
-      const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
-      pass(in, chunk, frame_sums_[w].data(), coupling_.data() + chunk.first_pair * kWidth, landmarks_.data());
-      if (chunk.frozen) continue;
+  std::vector<LinearizeResult> results(parts_.size());
+  for_parts([&](std::size_t index, std::size_t) {
+    Part& part = parts_[index];
+    std::fill(part.frame_sums.begin(), part.frame_sums.end(), 0.0);
+    // Such that the sums of a frame are where the pass looks for them, counting from frame 0.
+    double* sums = part.frame_sums.data() - static_cast<std::ptrdiff_t>(part.frames_begin) * kSumWidth;
+    LinearizeResult& result = results[index];
+    for_chunks(index, [&](const LandmarkChunk& chunk) {
+      pass(in, chunk, sums, coupling_.data() + chunk.first_pair * kWidth, landmarks_.data());
+      if (chunk.frozen) return;
       for (const int row : chunk.landmarks) {
         const double* landmark = landmarks_.data() + static_cast<std::size_t>(row) * kWidth;
         double difference = 0.0;
@@ -166,7 +179,7 @@ LinearizeResult LandmarkSystem::linearize(const LandmarkState& state, const Came
         for (int k = 6; k < 9; ++k)
           result.landmark_gradient_max = std::max(result.landmark_gradient_max, std::abs(landmark[k]));
       }
-    }
+    });
   });
   write_camera_blocks(system);
   LinearizeResult total;
@@ -201,8 +214,9 @@ void LandmarkSystem::write_camera_blocks(const CameraSystem& system) const {
   std::fill_n(system.gradient, size + kBorder, 0.0);
   for (int frame = 0; frame < problem_.num_frames; ++frame) {
     double total[kSums] = {};
-    for (const AlignedDoubles& own : frame_sums_) {
-      const double* sums = own.data() + static_cast<std::size_t>(frame) * kSumWidth;
+    for (const Part& part : parts_) {
+      if (frame < part.frames_begin || frame >= part.frames_end) continue;
+      const double* sums = part.frame_sums.data() + static_cast<std::size_t>(frame - part.frames_begin) * kSumWidth;
       for (int k = 0; k < kSums; ++k) total[k] += sum(load<Simd8<kOwnBytes>>(sums + k * kSimd8Width));
     }
     for (int k = kIntrinsicsU; k < kSums; ++k) intrinsics[k - kIntrinsicsU] += total[k];
@@ -251,11 +265,11 @@ void LandmarkSystem::landmark_blocks(double* blocks, double* gradients) const {
   }
 }
 
-bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBounds& bounds, int worker) {
-  const auto w = static_cast<std::size_t>(worker);
+bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBounds& bounds, Part& part,
+                                     Scratch& scratch) {
   double factors[6 * kChunkLandmarks];
-  double* border = scratch_[w].data();
-  double* whitened = border + kChunkLandmarks * kWidth;
+  double* border = scratch.border.data();
+  double* whitened = scratch.rows.data();
   for (std::size_t i = 0; i < chunk.landmarks.size(); ++i) {
     const auto row = static_cast<std::size_t>(chunk.landmarks[i]);
     const double* landmark = landmarks_.data() + row * kWidth;
@@ -273,12 +287,12 @@ bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBo
   if (chunk.frames.empty()) return true;
   std::fill_n(border + chunk.landmarks.size() * kWidth, (kChunkLandmarks - chunk.landmarks.size()) * kWidth, 0.0);
   const double* coupling = coupling_.data() + chunk.first_pair * kWidth;
-  double* tiles = tiles_[w].data();
+  double* tiles = part.tiles.data();
   const auto frames = static_cast<std::size_t>(problem_.num_frames);
-  double* border_tiles = tiles + static_cast<std::size_t>(tile_begin_[w][frames]) * kTile;
-  int* place = scratch_place_[w].data();
+  double* border_tiles = tiles + static_cast<std::size_t>(part.tile_begin[frames]) * kTile;
+  int* place = scratch.place.data();
   const landmark_passes::TileInput input{
-      whitened, border, place, tile_begin_[w].data(), tiles, border_tiles, border_tiles + frames * kTile};
+      whitened, border, place, part.tile_begin.data(), tiles, border_tiles, border_tiles + frames * kTile};
   if (!poses_free_) {
     landmark_passes::multiply_scales(chunk, coupling, factors, whitened, input);
     return true;
@@ -294,13 +308,12 @@ bool LandmarkSystem::eliminate_chunk(const LandmarkChunk& chunk, const DampingBo
 bool LandmarkSystem::reduce(const DampingBounds& bounds, const CameraSystem& hessian, const CameraSystem& reduced) {
   reduced_ = false;
   std::atomic<bool> positive{true};
-  parallel_for(workers(), workers(), [&](int worker, int, int) {
-    const auto w = static_cast<std::size_t>(worker);
-    std::fill(tiles_[w].begin(), tiles_[w].end(), 0.0);
-    for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1] && positive; ++i) {
-      const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
-      if (!chunk.frozen && !eliminate_chunk(chunk, bounds, worker)) positive = false;
-    }
+  for_parts([&](std::size_t index, std::size_t worker) {
+    Part& part = parts_[index];
+    std::fill(part.tiles.begin(), part.tiles.end(), 0.0);
+    for_chunks(index, [&](const LandmarkChunk& chunk) {
+      if (positive && !chunk.frozen && !eliminate_chunk(chunk, bounds, part, scratch_[worker])) positive = false;
+    });
   });
   if (!positive) return false;
   write_reduced(bounds, hessian, reduced);
@@ -331,11 +344,12 @@ void LandmarkSystem::write_reduced(const DampingBounds& bounds, const CameraSyst
     for (int frame = begin; frame < end; ++frame) {
       const auto f = static_cast<std::size_t>(frame);
       const int* columns = problem_.columns.data() + f * kFrameColumns;
-      for (std::size_t w = 0; w < tiles_.size(); ++w) {
-        const double* tile = tiles_[w].data() + static_cast<std::size_t>(tile_begin_[w][f]) * kTile;
+      for (const Part& part : parts_) {
+        if (frame < part.frames_begin || frame >= part.frames_end) continue;
+        const double* tile = part.tiles.data() + static_cast<std::size_t>(part.tile_begin[f]) * kTile;
         // Tile (frame, other) has rows of `frame` and columns of `other` >= frame. The core stores its lower triangle
         // by columns: entry (row of `other`, column of `frame`), and within the tile of a frame with itself j >= i.
-        for (int other = frame; other <= last_frame_[w][f]; ++other, tile += kTile) {
+        for (int other = frame; other <= part.last_frame[f]; ++other, tile += kTile) {
           const int* rows = problem_.columns.data() + static_cast<std::size_t>(other) * kFrameColumns;
           for (int i = 0; i < kFrameColumns; ++i) {
             if (columns[i] < 0) continue;
@@ -344,7 +358,7 @@ void LandmarkSystem::write_reduced(const DampingBounds& bounds, const CameraSyst
               if (rows[j] >= 0) column[rows[j]] -= tile[i * kSimd8Width + j];
           }
         }
-        const double* border = tiles_[w].data() + (static_cast<std::size_t>(tile_begin_[w][frames]) + f) * kTile;
+        const double* border = part.tiles.data() + (static_cast<std::size_t>(part.tile_begin[frames]) + f) * kTile;
         for (int i = 0; i < kFrameColumns; ++i) {
           if (columns[i] < 0) continue;
           for (int k = 0; k < kBorder; ++k) reduced.border[columns[i] * kBorder + k] -= border[i * kSimd8Width + k];
@@ -353,8 +367,8 @@ void LandmarkSystem::write_reduced(const DampingBounds& bounds, const CameraSyst
       }
     }
   });
-  for (std::size_t w = 0; w < tiles_.size(); ++w) {
-    const double* corner = tiles_[w].data() + (static_cast<std::size_t>(tile_begin_[w][frames]) + frames) * kTile;
+  for (const Part& part : parts_) {
+    const double* corner = part.tiles.data() + (static_cast<std::size_t>(part.tile_begin[frames]) + frames) * kTile;
     for (int i = 0; i < kBorder; ++i) {
       for (int k = 0; k < kBorder; ++k) reduced.corner[i * kBorder + k] -= corner[i * kSimd8Width + k];
       reduced.gradient[size + i] += corner[i * kSimd8Width + kBorder];
@@ -371,13 +385,11 @@ StepSums LandmarkSystem::back_substitute(const double* camera_step, const double
     }
   const double* intrinsics_step = camera_step + problem_.num_columns;
   std::fill_n(landmark_step, 3 * static_cast<std::size_t>(problem_.num_landmarks), 0.0);
-  std::vector<StepSums> sums(static_cast<std::size_t>(workers()));
-  parallel_for(workers(), workers(), [&](int worker, int, int) {
-    const auto w = static_cast<std::size_t>(worker);
+  std::vector<StepSums> sums(parts_.size());
+  for_parts([&](std::size_t part, std::size_t) {
     StepSums own;
-    for (int i = plan_.worker_begin[w]; i < plan_.worker_begin[w + 1]; ++i) {
-      const LandmarkChunk& chunk = plan_.chunks[static_cast<std::size_t>(i)];
-      if (chunk.frozen) continue;
+    for_chunks(part, [&](const LandmarkChunk& chunk) {
+      if (chunk.frozen) return;
       double moved[3 * kChunkLandmarks] = {};
       landmark_passes::apply_coupling(chunk, coupling_.data() + chunk.first_pair * kWidth, frame_step.data(), moved);
       for (std::size_t n = 0; n < chunk.landmarks.size(); ++n) {
@@ -397,8 +409,8 @@ StepSums LandmarkSystem::back_substitute(const double* camera_step, const double
           own.squared += x[j] * x[j];
         }
       }
-    }
-    sums[w] = own;
+    });
+    sums[part] = own;
   });
   StepSums total;
   for (const StepSums& own : sums) {

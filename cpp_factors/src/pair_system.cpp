@@ -202,13 +202,11 @@ PairSystem::PairSystem(int num_poses, const PairRows& rows, const Kernel& kernel
     inverse_sigma_u_[i] = 1.0 / rows.sigma[columns * n];
     inverse_sigma_v_[i] = 1.0 / rows.sigma[columns * n + columns - 1];
     weight_[i] = rows.weight[n];
-    const Pair pair{static_cast<int>(rows.source[n]), static_cast<int>(rows.target[n])};
     const int row = static_cast<int>(i);
-    const bool new_pair = pairs_.empty() || pairs_.back().source != pair.source || pairs_.back().target != pair.target;
-    if (new_pair) pairs_.push_back(pair);
-    if (new_pair || row - tiles_.back().begin == kTileRows)
-      tiles_.push_back({static_cast<int>(pairs_.size()) - 1, row, row});
-    tiles_.back().end = row + 1;
+    const Pair pair{static_cast<int>(rows.source[n]), static_cast<int>(rows.target[n]), row, row};
+    if (pairs_.empty() || pairs_.back().source != pair.source || pairs_.back().target != pair.target)
+      pairs_.push_back(pair);
+    pairs_.back().end = row + 1;
   }
 }
 
@@ -220,51 +218,46 @@ std::vector<Pose> PairSystem::relative_poses(const double* poses) const {
   return relative;
 }
 
-int PairSystem::workers() const { return useful_threads(threads_, static_cast<int>(weight_.size()), kRowsPerThread); }
+template <typename F>
+void PairSystem::for_pairs(F f) const {
+  const int threads = useful_threads(threads_, static_cast<int>(weight_.size()), kRowsPerThread);
+  parallel_for(static_cast<int>(pairs_.size()), threads, [&](int begin, int end, int) {
+    for (int i = begin; i < end; ++i) f(static_cast<std::size_t>(i));
+  });
+}
+
+template <typename F>
+void PairSystem::for_tiles(const Pair& pair, F f) const {
+  for (int begin = pair.begin; begin < pair.end; begin += kTileRows) {
+    const auto at = static_cast<std::size_t>(begin);
+    f(TileInput{&u_source_[at],        &v_source_[at], &depth_[at],
+                &u_target_[at],        &v_target_[at], &inverse_sigma_u_[at],
+                &inverse_sigma_v_[at], &weight_[at],   std::min(pair.end - begin, kTileRows)});
+  }
+}
 
 double PairSystem::energy(const double* poses, const double* intrinsics) const {
   const Intrinsics k = load_intrinsics(intrinsics);
   const std::vector<Pose> relative = relative_poses(poses);
-  const int threads = workers();
-  std::vector<double> partial(static_cast<std::size_t>(threads), 0.0);
-  parallel_for(static_cast<int>(tiles_.size()), threads, [&](int begin, int end, int worker) {
-    double sum = 0.0;
-    for (int i = begin; i < end; ++i) {
-      const Tile& tile = tiles_[static_cast<std::size_t>(i)];
-      const auto at = static_cast<std::size_t>(tile.begin);
-      const TileInput in{&u_source_[at],        &v_source_[at], &depth_[at],
-                         &u_target_[at],        &v_target_[at], &inverse_sigma_u_[at],
-                         &inverse_sigma_v_[at], &weight_[at],   tile.end - tile.begin};
-      sum += energy_of_tile(relative[static_cast<std::size_t>(tile.pair)], k, kernel_, in);
-    }
-    partial[static_cast<std::size_t>(worker)] = sum;
+  std::vector<double> energies(pairs_.size(), 0.0);
+  for_pairs([&](std::size_t i) {
+    for_tiles(pairs_[i], [&](const TileInput& in) { energies[i] += energy_of_tile(relative[i], k, kernel_, in); });
   });
-  return std::accumulate(partial.begin(), partial.end(), 0.0);
+  return std::accumulate(energies.begin(), energies.end(), 0.0);
 }
 
 void PairSystem::linearize(const double* poses, const double* intrinsics, double* hessian, double* gradient) const {
   const Intrinsics k = load_intrinsics(intrinsics);
   const std::vector<Pose> relative = relative_poses(poses);
-  const int threads = workers();
-  const std::size_t width = pairs_.size() * kSums;
-  std::vector<double> partial(width * static_cast<std::size_t>(threads), 0.0);
-  parallel_for(static_cast<int>(tiles_.size()), threads, [&](int begin, int end, int worker) {
-    double* sums = partial.data() + width * static_cast<std::size_t>(worker);
-    for (int i = begin; i < end; ++i) {
-      const Tile& tile = tiles_[static_cast<std::size_t>(i)];
-      const auto at = static_cast<std::size_t>(tile.begin);
-      const TileInput in{&u_source_[at],        &v_source_[at], &depth_[at],
-                         &u_target_[at],        &v_target_[at], &inverse_sigma_u_[at],
-                         &inverse_sigma_v_[at], &weight_[at],   tile.end - tile.begin};
-      sums_of_tile(relative[static_cast<std::size_t>(tile.pair)], k, kernel_, in, sums + kSums * tile.pair);
-    }
+  std::vector<double> sums(pairs_.size() * kSums, 0.0);
+  for_pairs([&](std::size_t i) {
+    for_tiles(pairs_[i],
+              [&](const TileInput& in) { sums_of_tile(relative[i], k, kernel_, in, sums.data() + kSums * i); });
   });
-  for (int worker = 1; worker < threads; ++worker)
-    for (std::size_t i = 0; i < width; ++i) partial[i] += partial[width * static_cast<std::size_t>(worker) + i];
   std::fill(hessian, hessian + static_cast<std::size_t>(size_) * static_cast<std::size_t>(size_), 0.0);
   std::fill(gradient, gradient + size_, 0.0);
   for (std::size_t i = 0; i < pairs_.size(); ++i)
-    spread(pairs_[i], relative[i], &partial[kSums * i], hessian, gradient);
+    spread(pairs_[i], relative[i], &sums[kSums * i], hessian, gradient);
 }
 
 void PairSystem::spread(const Pair& pair, const Pose& target_T_source, const double* sums, double* hessian,

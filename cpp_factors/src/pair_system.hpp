@@ -49,16 +49,19 @@ class PairSystem {
   static constexpr int kSums = kColumns * (kColumns + 1) / 2;
 
  private:
+  /// Two poses and the rows [begin, end) of their factors. A pair is summed by one thread, so that no result depends on
+  /// the number of threads.
   struct Pair {
-    int source, target;
-  };
-  /// Consecutive rows of one pair: what a thread takes at a time.
-  struct Tile {
-    int pair, begin, end;
+    int source, target, begin, end;
   };
 
   std::vector<Pose> relative_poses(const double* poses) const;
-  int workers() const;
+  /// Call f(number) for every pair.
+  template <typename F>
+  void for_pairs(F f) const;
+  /// Call f(input) for every few rows of a pair, in order.
+  template <typename F>
+  void for_tiles(const Pair& pair, F f) const;
   void spread(const Pair& pair, const Pose& target_T_source, const double* sums, double* hessian,
               double* gradient) const;
 
@@ -66,8 +69,7 @@ class PairSystem {
   Kernel kernel_;
   std::vector<std::int64_t> pose_columns_, intrinsics_columns_;
   std::vector<Pair> pairs_;
-  std::vector<Tile> tiles_;
-  // One entry per factor, in the order of the tiles.
+  // One entry per factor, in the order of the pairs.
   std::vector<double> u_source_, v_source_, depth_, u_target_, v_target_, inverse_sigma_u_, inverse_sigma_v_, weight_;
 };
 

@@ -153,3 +153,16 @@ def test_whitening_equals_that_of_a_batch(
     for actual, expected in zip(scaled, expected_jacobians, strict=True):
         assert_close(actual, expected)
     assert _core.robust_energy(r, **noise) == pytest.approx(batch.energy(state), rel=1e-11, abs=1e-300)
+
+
+def test_robust_energy_is_the_same_for_any_number_of_threads() -> None:
+    rng = np.random.default_rng(3)
+    r, sigma, weight = rng.normal(size=(30_001, 2)), rng.uniform(0.5, 2.0, 30_001), rng.uniform(size=30_001)
+    energies = {
+        _core.robust_energy(r, sigma=sigma, weight=weight, kernel=1, threshold=1.3, threads=threads)
+        for threads in (1, 2, 3, 8)
+    }
+    assert len(energies) == 1
+    white = np.linalg.norm(r, axis=1) / sigma
+    rho = np.where(white <= 1.3, 0.5 * white**2, 1.3 * (white - 0.65))  # Huber
+    assert energies.pop() == pytest.approx(weight @ rho, rel=1e-12)

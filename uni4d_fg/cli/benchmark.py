@@ -85,7 +85,7 @@ Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Dask scheduler of a cluster whose workers do the runs.", show_default=False),
 ]
-Threads = Annotated[int, typer.Option(help="Threads of a run; other numbers give other last digits.")]
+Threads = Annotated[int, typer.Option(help="Threads of a run.")]
 TimeLimit = Annotated[
     float, typer.Option(metavar="MINUTES", help="A run in a process of its own is ended after this, and tried again.")
 ]

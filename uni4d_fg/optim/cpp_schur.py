@@ -31,10 +31,8 @@ from uni4d_fg.optim.linearized_landmarks import LinearizedLandmarks
 from uni4d_fg.optim.objective import SolvedPart, Step
 from uni4d_fg.optim.problem import Problem
 from uni4d_fg.optim.schur import SchurObjective
-from uni4d_fg.optim.threads import limit_blas_threads, thread_count
-
-_THREADED_SIZE = 600
-"""Dense systems from this size on are factorized by all threads; below, a second one costs more than it gains."""
+from uni4d_fg.optim.threads import one_blas_thread, thread_count
+from uni4d_fg.optim.tiled_cholesky import cholesky
 
 
 def refusal(problem: Problem, state: State | None = None) -> str:
@@ -90,7 +88,7 @@ class CppSchurObjective:
             problem: A problem that :func:`refusal` says nothing against.
             state: Any state of the problem (only array lengths are read).
             config: Bounds of the damping diagonal.
-            threads: Worker threads; the number of cores when None.
+            threads: Worker threads, on which no result depends; the number of cores when None.
 
         Raises:
             SolverError: If the problem is refused, or an array is.
@@ -309,14 +307,13 @@ class CppSchurLinearization:
         step, border = np.zeros(n + columns.border), reduced.border[:, free]
         right = np.column_stack([border, reduced.gradient[:n]])
         if n:
-            threads = self.objective.threads if n >= _THREADED_SIZE and not columns.banded else 1
-            with limit_blas_threads(threads):
+            with one_blas_thread():
                 if columns.banded:
                     factor, info = lapack.dpbtrf(reduced.core.T, lower=1, overwrite_ab=1)
                     solution = lapack.dpbtrs(factor, right, lower=1)[0] if info == 0 else None
                 else:
-                    factor, info = lapack.dpotrf(reduced.core.T, lower=1, overwrite_a=1, clean=0)
-                    solution = lapack.dpotrs(factor, right, lower=1)[0] if info == 0 else None
+                    factor = cholesky(reduced.core.T, self.objective.threads)
+                    solution = None if factor is None else lapack.dpotrs(factor, right, lower=1)[0]
             if solution is None:
                 return None
             right = solution

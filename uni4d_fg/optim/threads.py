@@ -22,15 +22,10 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def limit_blas_threads(limit: int) -> AbstractContextManager[Any]:
-    """Limit BLAS to a number of threads per caller."""
-    limited: AbstractContextManager[Any] = _controller().limit(limits=limit, user_api="blas")
-    return limited
-
-
 def one_blas_thread() -> AbstractContextManager[Any]:
     """Limit BLAS to one thread per caller while our own threads divide the work."""
-    return limit_blas_threads(1)
+    limited: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
+    return limited
 
 
 def on_one_blas_thread(function: Callable[P, ResultT]) -> Callable[P, ResultT]:
@@ -52,7 +47,8 @@ _limits: list[int] = []
 def thread_limit(count: int) -> Iterator[None]:
     """Give all array code of this process a number of threads: the solvers, BLAS, OpenMP and OpenCV.
 
-    Results of equal numbers are equal to the last bit, on as many cores as there may be.
+    Solvers give the same on any number of threads. Libraries may not: results of equal numbers are equal to the last
+    bit, on as many cores as there may be.
     """
     import cv2
 

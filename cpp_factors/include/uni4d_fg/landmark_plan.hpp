@@ -77,11 +77,14 @@ struct LandmarkChunk {
 struct LandmarkPlan {
   std::vector<LandmarkChunk> chunks;
   std::int64_t num_pairs = 0;  ///< of free landmarks
-  /// (workers + 1) first chunk of each worker, of about equal cost.
-  std::vector<int> worker_begin;
+  /// (parts + 1) first chunk of each part, of about equal cost. Sums are those of the parts, added in their order, and
+  /// parts depend on the problem alone: results do not depend on the number of threads.
+  std::vector<int> part_begin;
+
+  int num_parts() const { return static_cast<int>(part_begin.size()) - 1; }
 };
 
-/// Sort and cut; `threads` bounds the number of workers.
+/// Sort and cut, on up to `threads` threads.
 LandmarkPlan plan_landmarks(const LandmarkProblem& problem, int threads);
 
 }  // namespace uni4d_fg

@@ -9,6 +9,7 @@
 // adjustment - a modern synthesis"; damping is Marquardt's, on the clamped diagonal, before the elimination.
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 #include "uni4d_fg/landmark_plan.hpp"
@@ -52,7 +53,7 @@ constexpr int kBorder = 4;
 
 class LandmarkSystem {
  public:
-  /// Plan once; `threads` bounds the number of workers. The arrays of the batches are not read afterwards.
+  /// Plan once; no result depends on the number of `threads`. The arrays of the batches are not read afterwards.
   /// Throws std::invalid_argument if frames that share a landmark are further apart than the stored rows.
   LandmarkSystem(LandmarkProblem problem, int threads);
 
@@ -110,12 +111,23 @@ class LandmarkSystem {
   bool reduced() const { return reduced_; }
 
  private:
+  /// The sums over some of the chunks, and the scratch memory of a thread.
+  struct Part;
+  struct Scratch;
+
+  Part make_part(int index) const;
   void check_storage(const std::vector<int>& last_frame) const;
   void write_camera_blocks(const CameraSystem& system) const;
   void write_reduced(const DampingBounds& bounds, const CameraSystem& hessian, const CameraSystem& reduced) const;
-  bool eliminate_chunk(const LandmarkChunk& chunk, const DampingBounds& bounds, int worker);
+  bool eliminate_chunk(const LandmarkChunk& chunk, const DampingBounds& bounds, Part& part, Scratch& scratch);
   double* core_column(const CameraSystem& system, int column) const;
-  int workers() const { return static_cast<int>(plan_.worker_begin.size()) - 1; }
+  int workers() const { return std::min(threads_, plan_.num_parts()); }
+  /// Call f(part, worker) for the number of every part, in order on each of the workers.
+  template <typename F>
+  void for_parts(F f) const;
+  /// Call f(chunk) for the chunks of a part.
+  template <typename F>
+  void for_chunks(std::size_t part, F f) const;
 
   void index_pairs();
 
@@ -132,15 +144,8 @@ class LandmarkSystem {
   /// (N, 6) Cholesky factor of the damped V: 1/l00, l10, 1/l11, l20, l21, 1/l22.
   std::vector<double> factors_;
   DampingBounds bounds_{0.0, 0.0, 0.0};
-  /// Per worker (T, kSums, 8): sums over the records of a frame, a lane each.
-  std::vector<AlignedDoubles> frame_sums_;
-  /// Per worker and frame: last frame that shares a landmark, and where the row's tiles begin.
-  std::vector<std::vector<int>> last_frame_;
-  std::vector<std::vector<std::int64_t>> tile_begin_;
-  /// Per worker (tiles, 7, 8): sums of E V^{-1} E^T, upper block triangle; then per frame the tile of the border.
-  std::vector<AlignedDoubles> tiles_;
-  std::vector<AlignedDoubles> scratch_;
-  std::vector<std::vector<int>> scratch_place_;
+  std::vector<Part> parts_;
+  std::vector<Scratch> scratch_;  ///< per worker
   /// Pairs of every free landmark, in the order of their frames; made when first asked for.
   struct LandmarkPair {
     std::int64_t pair;
@@ -149,6 +154,25 @@ class LandmarkSystem {
   std::vector<std::int64_t> pairs_begin_, pairs_end_;  ///< (N,)
   std::vector<LandmarkPair> pairs_of_landmark_;
   bool linearized_ = false, reduced_ = false;
+};
+
+struct LandmarkSystem::Part {
+  /// Frames [begin, end) that see landmarks of these chunks, and their sums (end - begin, kSums, 8) over the records of
+  /// a frame, a lane each.
+  int frames_begin = 0, frames_end = 0;
+  AlignedDoubles frame_sums;
+  /// Tile (i, j) of E V^{-1} E^T, frames i <= j, is needed if a landmark of these chunks is seen in both. Row i has
+  /// tiles for j = i .. last_frame[i], the first at tile_begin[i]; behind all rows come one tile per frame for its
+  /// border (intrinsics and gradient) and one for the border with itself.
+  std::vector<int> last_frame;           ///< (T,)
+  std::vector<std::int64_t> tile_begin;  ///< (T + 1,)
+  AlignedDoubles tiles;                  ///< (tiles + T + 1, 7, 8)
+};
+
+struct LandmarkSystem::Scratch {
+  AlignedDoubles border;   ///< (64, 3, 8): whitened intrinsics rows and gradient of a chunk's landmarks
+  AlignedDoubles rows;     ///< whitened rows of a chunk's pairs, or of its frames
+  std::vector<int> place;  ///< (frames, 64)
 };
 
 }  // namespace uni4d_fg

@@ -20,7 +20,7 @@ class WorkerOptions:
     scheduler: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
     threads: int = 1
-    """Threads of every task, here or there: sums in the solvers depend on them in the last digits."""
+    """Threads of every task, here or there: what networks find may depend on them in the last digits."""
     time_limit: float | None = 6 * 3600.0
     """A task that takes longer is ended, s; needs processes of their own."""
     retries: int = 2
