@@ -202,6 +202,35 @@ def test_frames_whose_masks_lose_feet_follow_the_others_by_apparent_size() -> No
     np.testing.assert_allclose(found, z, rtol=0.02)
 
 
+@pytest.mark.parametrize(
+    ("whole", "at_border", "stands"),
+    [
+        (1.0, 0.85, True),  # it comes nearer until its feet are below the image
+        (0.6, 0.85, False),  # its lower part was missed in the frames in which it does not reach the border
+    ],
+)
+def test_what_is_seen_whole_in_some_frames_stands_where_it_does_there(
+    whole: float, at_border: float, stands: bool
+) -> None:
+    centers, middle = camera(0.0), thing(speed_z=-0.2)
+    tracks, z = seen(middle, centers, 0.1), (middle - centers)[:, 2]
+    is_cut = np.arange(FRAMES) >= 0.4 * FRAMES
+    contacts = tuple({3: value} for value in (np.where(is_cut, at_border, whole) / z).tolist())
+    found = Sightings(tracks)
+    for frame in range(FRAMES):
+        mask = np.zeros(SIZE, dtype=np.int32)
+        mask[: 240 if is_cut[frame] else 239] = 3
+        found.add(frame, mask)
+    placed = place_moving(contacts, found, tracks, poses(centers), INTRINSICS, EXACT)
+    ratio = np.array([values[3] for values in placed.inverse_depth]) * z
+    assert placed.open == ([] if stands else [3])
+    if stands:
+        np.testing.assert_allclose(ratio, 1.0, rtol=0.02)
+    else:
+        # As where it is always cut off: nearer by the mean of what is likely.
+        assert np.median(ratio) == pytest.approx(at_border * np.exp(weigh(0.0, np.inf, True).log_ratio), rel=0.03)
+
+
 def test_things_without_tracks_and_frames_without_things_are_left_alone() -> None:
     nothing = Tracks(np.zeros((0, 3, 2), np.float32), np.zeros((0, 3), dtype=bool), np.zeros(0, dtype=np.int32))
     found = Sightings(nothing)

@@ -61,6 +61,16 @@ class MotionMaskConfig(Section):
     )
     background_track_weight: float = setting(2.0, "What ``track_weight`` is in the second look.", ge=0)
     background_smoothing_px: int = setting(8, "What ``smoothing_px`` is in the second look.", ge=1)
+    memory: float = setting(
+        0.9,
+        "What the second look says of a surface is averaged over time along optical flow: each frame before and behind "
+        "weighs this part of the one nearer; 0 for not.",
+        ge=0,
+        lt=1,
+    )
+    memory_contrast: float = setting(
+        12.0, "A surface is followed to where its color differs by less than about this, gray levels.", gt=0
+    )
     shadow_window_px: int = setting(
         15, "Side of the window in which a shadow darkens the background evenly, working px.", ge=3
     )

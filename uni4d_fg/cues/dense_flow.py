@@ -48,8 +48,8 @@ class DenseFlow:
 
 
 def warp_back(values: npt.NDArray[np.float32], flow: Float32Array, outside: float = 0.0) -> Float32Array:
-    """Return what ``values`` (H, W) hold at ``u + flow(u)``, bilinearly; ``outside`` beyond the image."""
-    height, width = values.shape
+    """Return what ``values`` (H, W) or (H, W, C) hold at ``u + flow(u)``, bilinearly; ``outside`` beyond the image."""
+    height, width = values.shape[:2]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     return np.asarray(
         cv2.remap(
@@ -58,7 +58,7 @@ def warp_back(values: npt.NDArray[np.float32], flow: Float32Array, outside: floa
             rows + flow[..., 1],
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
-            borderValue=outside,
+            borderValue=(outside,) * 4,
         ),
         np.float32,
     )

@@ -12,6 +12,7 @@ from uni4d_fg.arrays import BoolArray, Float32Array
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.background_comparison import BackgroundComparison
 from uni4d_fg.cues.detections import FrameDetections
+from uni4d_fg.cues.evidence_over_time import LookedAt, averaged_over_time
 from uni4d_fg.cues.frame_comparison import ComparedVideo
 from uni4d_fg.cues.moving_regions import grown, moving_region, smoothed_evidence, trusted_components
 from uni4d_fg.cues.neighbor_comparison import NeighborComparison
@@ -48,14 +49,21 @@ def second_look(
         Cancelled: If ``stop`` turned true.
     """
     comparison = BackgroundComparison(given, config, first)
+    looked = averaged_over_time(_looked_at(comparison, config, stop), config)
+    for frame, (image, evidence) in enumerate(looked):
+        region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
+        region = end_at_colors(region, image, evidence < 0, given.tracks, given.motion, frame, comparison.scale, config)
+        masks = grown(_trusted(region, frame, given, config), config.grow_px)
+        yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
+
+
+def _looked_at(
+    comparison: BackgroundComparison, config: MotionMaskConfig, stop: Callable[[], bool]
+) -> Generator[LookedAt, None, None]:
     radius = config.background_smoothing_px * comparison.scale[0]
     for frame, evidence in enumerate(comparison.evidence(stop)):
         image = comparison.frames[frame].image
-        smooth = smoothed_evidence(evidence, image, radius, config)
-        region = np.asarray(_trusted(_above_threshold(smooth, given, config), frame, given, config).any(axis=0))
-        region = end_at_colors(region, image, smooth < 0, given.tracks, given.motion, frame, comparison.scale, config)
-        masks = grown(_trusted(region, frame, given, config), config.grow_px)
-        yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
+        yield LookedAt(image, smoothed_evidence(evidence, image, radius, config))
 
 
 def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:

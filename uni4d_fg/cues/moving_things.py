@@ -53,6 +53,8 @@ class Sightings:
     """By id: (K,) frames in which a track is inside the mask."""
     area: dict[int, IntArray] = field(default_factory=dict)
     """By id: (2,) its area, px, of all frames together, and of those in which the image's lower border cuts it off."""
+    cut_in: dict[int, set[int]] = field(default_factory=dict)
+    """By id: those frames."""
 
     def add(self, frame: int, mask: Int32Array) -> None:
         """Add the mask (H, W) of a frame."""
@@ -66,6 +68,8 @@ class Sightings:
             inside[seen[at == label]] += 1
             width = np.count_nonzero(mask == label, axis=1)
             is_cut = width[-1] > _CUT_WIDTH * width.max()
+            if is_cut:
+                self.cut_in.setdefault(label, set()).add(frame)
             self.area.setdefault(label, np.zeros(2, np.int64))[:] += int(width.sum()) * np.array([1, is_cut])
 
     def is_cut(self, label: int) -> bool:
@@ -117,12 +121,12 @@ def place_moving(
     unknown = []
     for label in sorted(sightings.inside):
         mine = sightings.on(label)
-        cut = sightings.is_cut(label)
+        cut_in = sightings.cut_in.get(label, set())
         stretches = list[Parallax]()
         if np.count_nonzero(mine) >= _MIN_TRACKS:
             uv = tracks.uv[mine].astype(np.float64)
             stretches = moving_parallax(uv, tracks.visible[mine], world_T_cam, intrinsics, noise)
-        shown = False
+        is_known = False
         for parallax in stretches:
             frames = [
                 frame for frame in range(parallax.first, parallax.first + len(parallax.size))
@@ -131,15 +135,20 @@ def place_moving(
             if not frames:
                 continue
             size = parallax.size[np.array(frames) - parallax.first]
-            standing = float(np.quantile([contacts[frame][label] for frame in frames] / size, NEAREST_SHARE))
+            at_size_one = np.array([contacts[frame][label] for frame in frames]) / size
+            standing = float(np.quantile(at_size_one, NEAREST_SHARE))
+            # Seen whole in some frames, a thing stands where it does there: in others it goes on below the image,
+            # nearer than what is at the border, and where its feet were missed it seems farther.
+            nearest = [frame in cut_in for frame in np.array(frames)[at_size_one >= standing].tolist()]
+            cut = 2 * sum(nearest) > len(nearest)
             weighed = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut)
             tells = not weighed.contradicts and parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
-            shown |= tells
+            is_known |= tells or not cut
             for frame, here in zip(frames, size.tolist(), strict=True):
                 placed[frame][label] = np.exp(weighed.log_ratio) * standing * here
             if tells and not weighed.stands:
                 nearer.setdefault(label, []).append(float(np.exp(weighed.log_ratio)))
-        if cut and not shown:
+        if sightings.is_cut(label) and not is_known:
             unknown.append(label)
     return Placed(tuple(placed), {label: float(np.median(ratios)) for label, ratios in nearer.items()}, unknown)
 
