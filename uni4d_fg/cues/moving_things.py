@@ -54,7 +54,7 @@ class Sightings:
     area: dict[int, IntArray] = field(default_factory=dict)
     """By id: (2,) its area, px, of all frames together, and of those in which the image's lower border cuts it off."""
     cut_in: dict[int, set[int]] = field(default_factory=dict)
-    """By id: those frames."""
+    """By id: the frames in which it does."""
 
     def add(self, frame: int, mask: Int32Array) -> None:
         """Add the mask (H, W) of a frame."""
@@ -126,7 +126,7 @@ def place_moving(
         if np.count_nonzero(mine) >= _MIN_TRACKS:
             uv = tracks.uv[mine].astype(np.float64)
             stretches = moving_parallax(uv, tracks.visible[mine], world_T_cam, intrinsics, noise)
-        is_known = False
+        shown, cut_frames, all_frames = False, 0, 0
         for parallax in stretches:
             frames = [
                 frame for frame in range(parallax.first, parallax.first + len(parallax.size))
@@ -143,12 +143,14 @@ def place_moving(
             cut = 2 * sum(nearest) > len(nearest)
             weighed = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut)
             tells = not weighed.contradicts and parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
-            is_known |= tells or not cut
+            shown |= tells
+            cut_frames, all_frames = cut_frames + cut * len(frames), all_frames + len(frames)
             for frame, here in zip(frames, size.tolist(), strict=True):
                 placed[frame][label] = np.exp(weighed.log_ratio) * standing * here
             if tells and not weighed.stands:
                 nearer.setdefault(label, []).append(float(np.exp(weighed.log_ratio)))
-        if sightings.is_cut(label) and not is_known:
+        is_cut = 2 * cut_frames > all_frames if all_frames else sightings.is_cut(label)
+        if is_cut and not shown:
             unknown.append(label)
     return Placed(tuple(placed), {label: float(np.median(ratios)) for label, ratios in nearer.items()}, unknown)
 

@@ -44,12 +44,13 @@ def cholesky(matrix: FloatArray, threads: int) -> FloatArray | None:
             if info != 0:
                 return None
             matrix[columns, columns] = corner
-
-            def finish(row: int, columns: slice, before: FloatArray, corner: FloatArray) -> None:
-                rows = slice(row, row + TILE)
-                rest = matrix[rows, columns] - matrix[rows, : columns.start] @ before.T
-                matrix[rows, columns] = blas.dtrsm(1.0, corner, rest, side=1, lower=1, trans_a=1)
-
-            finish_rows = partial(finish, columns=columns, before=before, corner=corner)
-            map_in_order(finish_rows, list(range(start + TILE, len(matrix), TILE)), threads)
+            below = list(range(start + TILE, len(matrix), TILE))
+            map_in_order(partial(_finish_tile, matrix, columns), below, threads)
     return matrix
+
+
+def _finish_tile(matrix: FloatArray, columns: slice, row: int) -> None:
+    """Find L in the tile of some columns that begins at a row below the diagonal."""
+    rows, before = slice(row, row + TILE), slice(0, columns.start)
+    rest = matrix[rows, columns] - matrix[rows, before] @ matrix[columns, before].T
+    matrix[rows, columns] = blas.dtrsm(1.0, matrix[columns, columns], rest, side=1, lower=1, trans_a=1)
