@@ -6,10 +6,11 @@ threads they start, and that is after :func:`share_cores`.
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
@@ -45,6 +46,13 @@ def data_root() -> Path:
     if not root or not Path(root).is_dir():
         pytest.skip("set UNI4D_FG_DATA to the folder of the real sequences to run this test")
     return Path(root).resolve()
+
+
+@pytest.fixture
+def load_benchmark(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Any]:
+    """Import a module of the benchmarks, which finds those beside it."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module
 
 
 @pytest.fixture

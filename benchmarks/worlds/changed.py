@@ -9,6 +9,7 @@ a zoom was taken; seconds until cues are made; and warnings of the cameras: foca
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -27,6 +28,9 @@ from uni4d_fg.cues.scale_notes import NOT_METRIC
 from uni4d_fg.frontend.sequence.open_video import open_video
 from uni4d_fg.geometry.lens import Lens
 from uni4d_fg.results.evaluate.trajectory import evaluate_trajectory
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "slam" / "lens"))
+from warping import make_warp
 
 _K1 = -0.15
 _LAST_ZOOM = 1.5
@@ -69,16 +73,10 @@ def _scaled(image: ImageArray, factor: float) -> ImageArray:
 def _through_lens(clip: Clip) -> Clip:
     """Return what a lens would have shown, with corners that the clip has seen."""
     height, width = clip.images.shape[1:3]
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    pinhole, lens = np.array([clip.focal[0], clip.focal[0], *middle]), Lens("SIMPLE_RADIAL", (_K1,))
-    corner = np.zeros((1, 2))
-    moved = np.linalg.norm(lens.real_pixels(pinhole, corner) - middle)
-    factor = float(np.linalg.norm(corner - middle) / moved)
-    bent = pinhole * np.array([factor, factor, 1.0, 1.0])
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    source = ((lens.ideal_pixels(bent, np.stack([u, v], axis=-1)) - middle) / factor + middle).astype(np.float32)
-    warped = clip.mapped(lambda _, image: cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_CUBIC))
-    return replace(warped, focal=factor * clip.focal)
+    pinhole = np.array([clip.focal[0], clip.focal[0], (width - 1) / 2, (height - 1) / 2])
+    warp = make_warp(pinhole, Lens("SIMPLE_RADIAL", (_K1,)), (height, width))
+    warped = clip.mapped(lambda _, image: warp.frame(image, cv2.INTER_CUBIC))
+    return replace(warped, focal=warp.intrinsics[0] / pinhole[0] * clip.focal)
 
 
 def _zoomed(clip: Clip) -> Clip:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
-import importlib
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,10 @@ from scipy.spatial.transform import Rotation
 from uni4d_fg.errors import InputError
 from uni4d_fg.geometry.camera import project, world_to_camera
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
 
 @pytest.fixture
-def bal() -> Iterator[Any]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        yield importlib.import_module("bal")
+def bal(load_benchmark: Callable[[str], Any]) -> Any:
+    return load_benchmark("bal")
 
 
 def scene(num_cameras: int = 6, num_points: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -12,14 +10,8 @@ import pytest
 pytest.importorskip("uni4d_fg_cpp")
 
 
-@pytest.fixture
-def benchmark() -> Iterator[Any]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-        yield importlib.import_module("bundle_adjustment")
-
-
-def test_both_solvers_end_at_the_same_cost(benchmark: Any) -> None:
+def test_both_solvers_end_at_the_same_cost(load_benchmark: Callable[[str], Any]) -> None:
+    benchmark = load_benchmark("bundle_adjustment")
     problem, state = benchmark.make_problem(3500)
     start = sum(problem.energies(state).values())
     cpp, python = (benchmark.solve_ours(problem, state, threads=2, cpp=cpp) for cpp in (True, False))

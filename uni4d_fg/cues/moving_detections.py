@@ -31,11 +31,8 @@ def first_look(
         Cancelled: If ``stop`` turned true.
     """
     comparison = NeighborComparison(given, config)
-    for frame, evidence in enumerate(comparison.evidence(stop)):
-        smooth = smoothed_evidence(
-            evidence, comparison.frames[frame].image, config.smoothing_px * comparison.scale[0], config
-        )
-        region = _trusted(_above_threshold(smooth, given, config), frame, given, config).any(axis=0)
+    for frame, (_, evidence) in enumerate(_looked_at(comparison, config.smoothing_px, stop)):
+        region = _trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0)
         small = cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST)
         yield np.packbits(small)
 
@@ -49,7 +46,7 @@ def second_look(
         Cancelled: If ``stop`` turned true.
     """
     comparison = BackgroundComparison(given, config, first)
-    looked = averaged_over_time(_looked_at(comparison, config, stop), config)
+    looked = averaged_over_time(_looked_at(comparison, config.background_smoothing_px, stop), config)
     for frame, (image, evidence) in enumerate(looked):
         region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
         region = end_at_colors(region, image, evidence < 0, given.tracks, given.motion, frame, comparison.scale, config)
@@ -58,12 +55,13 @@ def second_look(
 
 
 def _looked_at(
-    comparison: BackgroundComparison, config: MotionMaskConfig, stop: Callable[[], bool]
+    comparison: NeighborComparison | BackgroundComparison, radius_px: float, stop: Callable[[], bool]
 ) -> Generator[LookedAt, None, None]:
-    radius = config.background_smoothing_px * comparison.scale[0]
+    """Yield what a comparison says of each frame, shared among like colors within a radius, image px."""
     for frame, evidence in enumerate(comparison.evidence(stop)):
         image = comparison.frames[frame].image
-        yield LookedAt(image, smoothed_evidence(evidence, image, radius, config))
+        radius = radius_px * float(comparison.scale[0])
+        yield LookedAt(image, smoothed_evidence(evidence, image, radius, comparison.config))
 
 
 def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:

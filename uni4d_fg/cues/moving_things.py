@@ -52,9 +52,9 @@ class Sightings:
     inside: dict[int, IntArray] = field(default_factory=dict)
     """By id: (K,) frames in which a track is inside the mask."""
     area: dict[int, IntArray] = field(default_factory=dict)
-    """By id: (2,) its area, px, of all frames together, and of those in which the image's lower border cuts it off."""
+    """By id: (T,) area of its mask, px."""
     cut_in: dict[int, set[int]] = field(default_factory=dict)
-    """By id: the frames in which it does."""
+    """By id: frames in which the image's lower border cuts it off."""
 
     def add(self, frame: int, mask: Int32Array) -> None:
         """Add the mask (H, W) of a frame."""
@@ -67,18 +67,18 @@ class Sightings:
             inside = self.inside.setdefault(label, np.zeros(self.tracks.num_tracks, np.int64))
             inside[seen[at == label]] += 1
             width = np.count_nonzero(mask == label, axis=1)
-            is_cut = width[-1] > _CUT_WIDTH * width.max()
-            if is_cut:
-                self.cut_in.setdefault(label, set()).add(frame)
-            self.area.setdefault(label, np.zeros(2, np.int64))[:] += int(width.sum()) * np.array([1, is_cut])
+            self.area.setdefault(label, np.zeros(self.tracks.num_frames, np.int64))[frame] += width.sum()
+            cut_in = self.cut_in.setdefault(label, set())
+            if width[-1] > _CUT_WIDTH * width.max():
+                cut_in.add(frame)
 
     def is_cut(self, label: int) -> bool:
         """Tell whether the image cuts a thing off in most of what it shows of it.
 
         Frames count by area: what is left of a mask while a thing comes and goes says nothing of where it stands.
         """
-        whole, cut = self.area[label].tolist()
-        return bool(cut > _MOSTLY * whole)
+        area = self.area[label]
+        return bool(area[list(self.cut_in[label])].sum() > _MOSTLY * area.sum())
 
     def on(self, label: int) -> BoolArray:
         """Return which tracks (K,) are on a thing."""
@@ -121,7 +121,6 @@ def place_moving(
     unknown = []
     for label in sorted(sightings.inside):
         mine = sightings.on(label)
-        cut_in = sightings.cut_in.get(label, set())
         stretches = list[Parallax]()
         if np.count_nonzero(mine) >= _MIN_TRACKS:
             uv = tracks.uv[mine].astype(np.float64)
@@ -139,7 +138,7 @@ def place_moving(
             standing = float(np.quantile(at_size_one, NEAREST_SHARE))
             # Seen whole in some frames, a thing stands where it does there: in others it goes on below the image,
             # nearer than what is at the border, and where its feet were missed it seems farther.
-            nearest = [frame in cut_in for frame in np.array(frames)[at_size_one >= standing].tolist()]
+            nearest = [frame in sightings.cut_in[label] for frame in np.array(frames)[at_size_one >= standing].tolist()]
             cut = 2 * sum(nearest) > len(nearest)
             weighed = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut)
             tells = not weighed.contradicts and parallax.sigma < _ON_IT * abs(parallax.inverse_depth)

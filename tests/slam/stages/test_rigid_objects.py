@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -288,11 +288,9 @@ def test_a_graph_of_gtsam_has_the_same_energy_and_keeps_the_end() -> None:
     np.testing.assert_allclose(again[OBJECT_POSE], state[OBJECT_POSE], atol=1e-12)
 
 
-def test_a_default_synthetic_scene() -> None:
+def test_a_default_synthetic_scene(load_benchmark: Callable[[str], Any]) -> None:
     pytest.importorskip("open3d")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[3] / "benchmarks"))
-        benchmark = importlib.import_module("rigid_objects")
+    benchmark = load_benchmark("rigid_objects")
     sequence = make_synthetic_sequence(SyntheticSceneConfig(seed=3, num_frames=16, render_images=False))
     found, summary, cameras = benchmark.search(sequence)
     assert found["object_instance"].tolist() == [1]
