@@ -39,7 +39,7 @@ def video(frames: int, evidence: np.ndarray) -> list[LookedAt]:
         image, said = background.copy(), np.full(SIZE, -2, np.float32)
         where = slice(30, 30 + SIDE), slice(left_of(frame), left_of(frame) + SIDE)
         image[where], said[where] = square, evidence[frame]
-        looked.append(LookedAt(image, said))
+        looked.append(LookedAt(image, said, np.ones(SIZE, np.float32)))
     return looked
 
 
@@ -56,6 +56,16 @@ def test_what_one_frame_says_of_a_surface_is_known_in_all() -> None:
         expected = weight @ said / weight.sum()
         assert np.median(found[frame][core(frame)]) == pytest.approx(expected, rel=0.1)  # flow is not exact
         assert np.median(found[frame][:24]) == pytest.approx(-2, abs=1e-3)
+
+
+def test_what_is_only_assumed_counts_less() -> None:
+    said = np.array([-1.0, 3.0, -1.0])
+    seen = np.array([0.3, 1.0, 0.3], np.float32)
+    frames = [f._replace(weight=np.full(SIZE, s)) for f, s in zip(video(3, said), seen, strict=True)]
+    for frame, found in enumerate(averaged(frames)):
+        weight = seen * DECAY ** np.abs(np.arange(3) - frame)
+        assert np.median(found[core(frame)]) == pytest.approx(weight @ said / weight.sum(), rel=0.05)
+        assert np.median(found[:24]) == pytest.approx(-2, abs=1e-3)
 
 
 def test_what_comes_out_from_behind_keeps_what_it_says() -> None:
@@ -75,7 +85,7 @@ def test_a_frame_alone_says_no_more_than_that() -> None:
 
 def test_other_colors_are_another_surface() -> None:
     frames = video(2, np.array([3.0, -1.0]))
-    inverted = LookedAt(255 - frames[0].image, frames[0].evidence)
+    inverted = frames[0]._replace(image=255 - frames[0].image)
     found = averaged([inverted, frames[1]])
     for own, frame in zip(found, (inverted, frames[1]), strict=True):
         # Inverted texture is alike where it is middle gray.

@@ -44,14 +44,14 @@ def tracks_at(uv: list[tuple[float, float]]) -> tuple[Tracks, TrackMotion]:
 
 
 def ended(
-    region: np.ndarray, image: np.ndarray, uv: list[tuple[float, float]], background: np.ndarray | None = None,
+    region: np.ndarray, image: np.ndarray, uv: list[tuple[float, float]], evidence: np.ndarray | None = None,
     **changes: int,
 ) -> np.ndarray:  # fmt: skip
     tracks, motion = tracks_at(uv)
     config = CONFIG.model_copy(update=changes)
     scale = np.array([image.shape[1] / region.shape[1], image.shape[0] / region.shape[0]])
-    background = np.zeros(image.shape[:2], bool) if background is None else background
-    return end_at_colors(region, image, background, tracks, motion, 0, scale, config)
+    evidence = np.ones(image.shape[:2], np.float32) if evidence is None else evidence
+    return end_at_colors(region, image, evidence, tracks, motion, 0, scale, config)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
@@ -125,9 +125,26 @@ def test_a_region_without_anything_around_it_is_returned(rng: np.random.Generato
 def test_what_is_background_for_sure_is_left_out_whatever_its_color(rng: np.random.Generator) -> None:
     mask = walker()
     image = picture(mask, rng)
-    known = np.zeros(mask.shape, bool)
-    known[:80] = True  # the red upper half is what a red wall shows
-    found = ended(mask, image, BESIDE, background=known)
+    evidence = np.ones(mask.shape, np.float32)
+    evidence[:80] = -1  # the red upper half is what a red wall shows
+    found = ended(mask, image, BESIDE, evidence)
     assert not found[:79].any()
     assert overlap(found[82:], mask[82:]) > 0.9
-    assert not ended(mask, image, BESIDE, background=np.ones(mask.shape, bool)).any()
+    assert not ended(mask, image, BESIDE, -np.ones(mask.shape, np.float32)).any()
+
+
+def test_what_moves_for_sure_stays_however_thin_and_whatever_its_color(rng: np.random.Generator) -> None:
+    image = np.clip(rng.normal(120, 6, (*SIZE, 3)), 0, 255).astype(np.uint8)
+    image[40:100, 40:100] = np.clip(rng.normal((30, 40, 110), 6, (60, 60, 3)), 0, 255)  # the colors are this thing's
+    region, thin = np.zeros(SIZE, bool), np.zeros(SIZE, bool)
+    thin[60:120, 150:156] = True
+    region[40:100, 40:100] = True
+    region |= thin
+    evidence = np.ones(SIZE, np.float32)
+    unsure = ended(region, image, [], evidence)
+    assert unsure[thin].mean() < 0.2
+    evidence[thin] = CONFIG.color_sure + 0.1
+    sure = ended(region, image, [], evidence)
+    assert sure[thin].all()
+    near = cv2.dilate(region.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    assert not (sure & ~near).any()

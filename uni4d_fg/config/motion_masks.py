@@ -121,7 +121,7 @@ class MotionMaskConfig(Section):
         "The same where depth is interpolated between points of the static scene: what masks miss is then put on what "
         "is behind it, which costs more than what they hold too much.",
     )
-    min_area_fraction: float = setting(0.002, "Regions smaller than this part of the image are dropped.", ge=0, lt=1)
+    min_area_fraction: float = setting(0.001, "Regions smaller than this part of the image are dropped.", ge=0, lt=1)
     max_static_fraction: float = setting(
         0.5, "Regions in which more than this share of the decided tracks is static are dropped.", ge=0, le=1
     )
@@ -131,6 +131,7 @@ class MotionMaskConfig(Section):
     color_core_px: int = setting(
         5, "What is farther than this from the edge of a region is certain to move, working px.", ge=1
     )
+    color_sure: float = setting(2.5, "So is what moves by more than these log odds, of 4 at most.", gt=0)
     color_margin_px: int = setting(12, "Static colors are also looked at this far around that reach, working px.", ge=1)
     color_track_px: int = setting(2, "Around a static track outside nothing moves up to here, working px.", ge=0)
     min_frames: int = setting(5, "Instances that move in fewer frames than this are dropped.", ge=1)

@@ -20,11 +20,13 @@ from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.appearance import ComparedFrame, FrameAppearance, compared_frame, frame_appearance, moved_evidence
 from uni4d_fg.cues.behind_moving import depth_behind
-from uni4d_fg.cues.frame_comparison import ComparedVideo, FrameComparison
+from uni4d_fg.cues.frame_comparison import ComparedVideo, Evidence, FrameComparison
 from uni4d_fg.cues.moving_regions import disk
 
 _AS_FIRST = 0.75
 """Log odds above the threshold, or below it, by what the first look said, where no frame shows the background."""
+_ASSUMED = 0.3
+"""Weight of that beside what frames show of the same surface at other times."""
 _OF_ALL = 3.0
 """Times the mean over frames, in which what one frame says is shared by others."""
 
@@ -103,7 +105,7 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
         # What is outside of the other frame, or hidden in it, has no evidence at all.
         return np.where((covered > 0) | (evidence == 0), np.float32(np.nan), evidence)
 
-    def combined(self, frame: int, said: Iterator[Float32Array]) -> Float32Array:
+    def combined(self, frame: int, said: Iterator[Float32Array]) -> Evidence:
         """Take the mean over the frames that show the background, and what the first look said where none does."""
         total, count = np.zeros(self.size, np.float32), np.zeros(self.size, np.float32)
         for evidence in (next(said) for _ in self.pairs(frame)):
@@ -112,5 +114,5 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
             count += shown
         at_first = np.where(self._moved_at_first(frame) > 0, self._threshold + _AS_FIRST, self._threshold - _AS_FIRST)
         mean = np.where(count > 0, np.float32(_OF_ALL) * total / np.maximum(count, 1), at_first)
-        tracks = self.track_evidence(frame)
-        return np.asarray(mean + np.float32(self.config.background_track_weight) * tracks, np.float32)
+        log_odds = mean + np.float32(self.config.background_track_weight) * self.track_evidence(frame)
+        return Evidence(log_odds.astype(np.float32), np.where(count > 0, 1, _ASSUMED).astype(np.float32))

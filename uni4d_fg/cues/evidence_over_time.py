@@ -41,7 +41,9 @@ class LookedAt(NamedTuple):
     image: ImageArray
     """(h, w, 3) at working size, RGB."""
     evidence: Float32Array
-    """(h, w) log odds."""
+    """(h, w) log odds, ..."""
+    weight: Float32Array
+    """... and how much each counts beside that of other frames (h, w)."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def averaged_over_time(frames: Iterator[LookedAt], config: MotionMaskConfig) -> 
             for n, behind in enumerate(_from_behind(held, followed, config.memory)[:done]):
                 known = before + _known(held[n])
                 both = known + behind
-                yield LookedAt(held[n].image, both[..., 0] / both[..., 1])
+                yield LookedAt(held[n].image, both[..., 0] / both[..., 1], both[..., 1])
                 if n < len(followed):
                     before = followed[n].before.carried(known, config.memory)
             held, followed = held[done:] + list(islice(frames, done)), followed[done:]
@@ -98,7 +100,7 @@ def averaged_over_time(frames: Iterator[LookedAt], config: MotionMaskConfig) -> 
 
 def _known(frame: LookedAt) -> Float32Array:
     """Return what a frame knows by itself: a sum of evidence, and its weight, (h, w, 2)."""
-    return np.stack([np.clip(frame.evidence, -_MOST, _MOST), np.ones_like(frame.evidence)], axis=-1)
+    return np.stack([frame.weight * np.clip(frame.evidence, -_MOST, _MOST), frame.weight], axis=-1)
 
 
 def _from_behind(held: list[LookedAt], followed: list[_Neighbors], decay: float) -> list[Float32Array]:

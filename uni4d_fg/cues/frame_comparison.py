@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +25,15 @@ from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
 
 PreparedT = TypeVar("PreparedT")
+
+
+class Evidence(NamedTuple):
+    """What is said of the pixels (h, w) of a frame."""
+
+    log_odds: Float32Array
+    """That they move."""
+    weight: Float32Array
+    """How much of it was seen, 0 to 1: less is assumed."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +84,11 @@ class FrameComparison(ABC, Generic[PreparedT]):
         """Return what the second frame of a pair says of the pixels (h, w) of the first; on any thread."""
 
     @abstractmethod
-    def combined(self, frame: int, said: Iterator[Float32Array]) -> Float32Array:
-        """Return the evidence (h, w) of a frame, log odds, from what its pairs say, in their order."""
+    def combined(self, frame: int, said: Iterator[Float32Array]) -> Evidence:
+        """Return the evidence of a frame from what its pairs say, in their order."""
 
-    def evidence(self, stop: Callable[[], bool]) -> Generator[Float32Array, None, None]:
-        """Yield the evidence (h, w) that pixels of a frame move, log odds at working size, frame by frame.
+    def evidence(self, stop: Callable[[], bool]) -> Generator[Evidence, None, None]:
+        """Yield the evidence that pixels of a frame move, at working size, frame by frame.
 
         Raises:
             Cancelled: If ``stop`` turned true.

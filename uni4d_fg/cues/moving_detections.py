@@ -31,8 +31,8 @@ def first_look(
         Cancelled: If ``stop`` turned true.
     """
     comparison = NeighborComparison(given, config)
-    for frame, (_, evidence) in enumerate(_looked_at(comparison, config.smoothing_px, stop)):
-        region = _trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0)
+    for frame, looked in enumerate(_looked_at(comparison, config.smoothing_px, stop)):
+        region = _trusted(_above_threshold(looked.evidence, given, config), frame, given, config).any(axis=0)
         small = cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST)
         yield np.packbits(small)
 
@@ -47,9 +47,9 @@ def second_look(
     """
     comparison = BackgroundComparison(given, config, first)
     looked = averaged_over_time(_looked_at(comparison, config.background_smoothing_px, stop), config)
-    for frame, (image, evidence) in enumerate(looked):
+    for frame, (image, evidence, _) in enumerate(looked):
         region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
-        region = end_at_colors(region, image, evidence < 0, given.tracks, given.motion, frame, comparison.scale, config)
+        region = end_at_colors(region, image, evidence, given.tracks, given.motion, frame, comparison.scale, config)
         masks = grown(_trusted(region, frame, given, config), config.grow_px)
         yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
 
@@ -58,10 +58,10 @@ def _looked_at(
     comparison: NeighborComparison | BackgroundComparison, radius_px: float, stop: Callable[[], bool]
 ) -> Generator[LookedAt, None, None]:
     """Yield what a comparison says of each frame, shared among like colors within a radius, image px."""
-    for frame, evidence in enumerate(comparison.evidence(stop)):
+    for frame, (log_odds, weight) in enumerate(comparison.evidence(stop)):
         image = comparison.frames[frame].image
         radius = radius_px * float(comparison.scale[0])
-        yield LookedAt(image, smoothed_evidence(evidence, image, radius, comparison.config))
+        yield LookedAt(image, smoothed_evidence(log_odds, image, radius, comparison.config), weight)
 
 
 def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:

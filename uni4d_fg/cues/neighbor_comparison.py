@@ -14,7 +14,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, ImageArray
 from uni4d_fg.cues.appearance import FrameAppearance, frame_appearance, moved_evidence, with_other_depth
 from uni4d_fg.cues.behind_moving import depth_behind
-from uni4d_fg.cues.frame_comparison import FrameComparison
+from uni4d_fg.cues.frame_comparison import Evidence, FrameComparison
 from uni4d_fg.cues.moving_regions import disk
 
 
@@ -64,7 +64,7 @@ class NeighborComparison(FrameComparison[NeighborFrame]):
             ours, theirs = one.behind, other.behind
         return moved_evidence(ours, theirs.compared, self.predicted(ours.z, pair), self.config)
 
-    def combined(self, frame: int, said: Iterator[Float32Array]) -> Float32Array:
+    def combined(self, frame: int, said: Iterator[Float32Array]) -> Evidence:
         """Add up the baselines and what the tracks say."""
         total, count = np.zeros(self.size, np.float32), 0
         for sides in self._by_baseline(frame):
@@ -73,4 +73,5 @@ class NeighborComparison(FrameComparison[NeighborFrame]):
                 count += 1
         if count:
             total *= len(self.config.baselines) / count
-        return total + np.float32(self.config.track_weight) * self.frames[frame].tracks
+        total += np.float32(self.config.track_weight) * self.frames[frame].tracks
+        return Evidence(total, np.ones_like(total))

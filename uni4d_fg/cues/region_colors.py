@@ -3,7 +3,8 @@
 What appearance and tracks say of a pixel is blurred, and silent where the image is flat: heads and legs are missed, and
 strips of background beside a thing are taken along. Inside a region and around it the colors of both tell which pixel
 belongs to which, and edges of the image where they part: GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004), as
-OpenCV has it. Only the core of a region is certain to move: what is thin has to be told by its colors, or goes.
+OpenCV has it. Certain to move are the core of a region and what evidence is sure of; what is thin and was hardly seen
+to move has to be told by its colors, or goes.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from uni4d_fg.arrays import BoolArray, FloatArray, ImageArray
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.moving_regions import disk, working_pixels
 from uni4d_fg.cues.track_motion import TrackMotion
@@ -26,7 +27,7 @@ _SEED = 0
 def end_at_colors(
     region: BoolArray,
     image: ImageArray,
-    is_background: BoolArray,
+    evidence: Float32Array,
     tracks: Tracks,
     motion: TrackMotion,
     frame: int,
@@ -38,7 +39,8 @@ def end_at_colors(
     Args:
         region: (H, W) True where something moves, by and large.
         image: (h, w, 3) uint8 RGB at working size.
-        is_background: (h, w) where nothing moves, whatever the color.
+        evidence: (h, w) log odds that pixels move. Below 0 they do not, and above ``config.color_sure`` within the
+            region they do, whatever the color.
         tracks: K tracks; around static ones outside the region nothing moves.
         motion: Which of them move.
         frame: The frame.
@@ -54,11 +56,12 @@ def end_at_colors(
     label = np.full(size, cv2.GC_BGD, np.uint8)
     label[near > 0] = cv2.GC_PR_BGD
     label[small > 0] = cv2.GC_PR_FGD
-    label[cv2.erode(small, disk(config.color_core_px)) > 0] = cv2.GC_FGD
+    core = cv2.erode(small, disk(config.color_core_px)) > 0
+    label[core | ((small > 0) & (evidence > config.color_sure))] = cv2.GC_FGD
     at_rest = np.zeros(size, np.uint8)
     at_rest[working_pixels(tracks.uv[motion.static & tracks.visible[:, frame], frame], size, scale)] = 1
     label[(cv2.dilate(at_rest, disk(config.color_track_px)) > 0) & (small == 0)] = cv2.GC_BGD
-    label[is_background] = cv2.GC_BGD
+    label[evidence < 0] = cv2.GC_BGD
     part = _around_region(near, config.color_margin_px)
     inside = label[part].copy()
     if _moves(inside).all():  # no other color to tell them from
