@@ -7,6 +7,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from uni4d_fg.arrays import FloatArray, ImageArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.errors import Cancelled
@@ -22,6 +24,7 @@ from uni4d_fg.pipeline.control import BegunControl, with_moving
 from uni4d_fg.pipeline.dense_maps import DenseMaps
 from uni4d_fg.pipeline.fuse_parts import can_be_sent, fuse_in_parts
 from uni4d_fg.pipeline.fused_frames import fused_frames
+from uni4d_fg.pipeline.path_uncertainty import path_uncertainty, share_right
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.pipeline.window_workers import WindowWorkers
 from uni4d_fg.progress import Reporter
@@ -99,6 +102,7 @@ def fuse_depth(
         landmark_sigma=known.sigma,
     )
     maps.try_matching()
+    right = share_right(path_uncertainty(scene["world_T_cam"], scene.get("pose_covariance")))
     told = ToldError(maps.is_interpolated, float(scene.get("focal_depth_error", 0.0)))
     remove_file(folder.confidence)
     with ExitStack() as files:
@@ -108,33 +112,35 @@ def fuse_depth(
         if config.static == "field":
             sure = files.enter_context(write_confidence(folder.confidence, sequence.num_frames, working))
         if workers is not None and can_be_sent(maps):
-            _on_workers(maps, workers, writer, sure, told, reporter)
+            _on_workers(maps, workers, writer, sure, told, right, reporter)
             return _summary(maps, told)
         for fused in fused_frames(maps, 0, sequence.num_frames):
             if should_stop():
                 raise Cancelled(_STOPPED)
             writer.write(fused.frame, fused.depth)
-            _note(sure, told, fused.confidence, fused.told)
+            _note(sure, told, right, fused.confidence, fused.told)
             reporter.advance(fused.frame + 1)
     return _summary(maps, told)
 
 
 def _on_workers(
     maps: DenseMaps, workers: WindowWorkers, writer: DepthWriter, sure: ConfidenceWriter | None, told: ToldError,
-    reporter: Reporter,
+    right: float, reporter: Reporter,
 ) -> None:  # fmt: skip
     try:
         for part in fuse_in_parts(maps, writer, workers, reporter.advance):
             for confidence, of_frame in zip(part.confidence, part.told, strict=True):
-                _note(sure, told, confidence, of_frame)
+                _note(sure, told, right, confidence, of_frame)
     except Cancelled as error:
         raise Cancelled(_STOPPED) from error
 
 
-def _note(sure: ConfidenceWriter | None, told: ToldError, confidence: ImageArray | None, of_frame: ToldError) -> None:
-    """Keep how sure the next frame's depth is, and what is told of its error."""
+def _note(
+    sure: ConfidenceWriter | None, told: ToldError, right: float, confidence: ImageArray | None, of_frame: ToldError
+) -> None:
+    """Keep how sure the next frame's depth is (the cameras share ``right`` of that), and what is told of its error."""
     if sure is not None and confidence is not None:
-        sure.write_steps(confidence)
+        sure.write_steps(np.rint(right * confidence).astype(np.uint8))
         told.follow(of_frame)
 
 

@@ -12,6 +12,7 @@ from uni4d_fg.frontend.sequence.calibration import given_doubts, unusual_focal
 from uni4d_fg.frontend.sequence.model import Sequence, Video
 from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import LabelledTracks, TrackLabel
+from uni4d_fg.pipeline.path_uncertainty import path_uncertainty
 from uni4d_fg.robust import WITHIN_95
 
 _MAX_FOCAL_CHANGE = 0.15
@@ -187,15 +188,12 @@ def scene_warnings(
         if not focal_sigma <= _MAX_FOCAL_SIGMA:
             text += ", and the focal length is poorly determined"
         return [*warnings, text]
-    if pose_covariance is not None and len(world_T_cam) > 1:
-        path = float(np.linalg.norm(np.diff(world_T_cam[:, :3, 3], axis=0), axis=1).sum())
-        variance = np.einsum("nii->n", pose_covariance[1:, 3:, 3:])
-        uncertainty = float(np.sqrt(np.maximum(variance, 0.0).mean())) / path
-        if uncertainty > _MAX_UNCERTAINTY:  # false where it is not known
-            warnings.append(
-                f"camera positions are uncertain by {100 * uncertainty:.0f} % of the path's length: too little that is "
-                "static is seen well; look at masks, tracks and the share of the image that moves"
-            )
+    uncertainty = path_uncertainty(world_T_cam, pose_covariance)
+    if uncertainty > _MAX_UNCERTAINTY:  # false where it is not known
+        warnings.append(
+            f"camera positions are uncertain by {100 * uncertainty:.0f} % of the path's length: too little that is "
+            "static is seen well; look at masks, tracks and the share of the image that moves"
+        )
     return warnings if focal_was_doubted else warnings + _open_focal(intrinsics, focal_sigma)
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from viewing_samples import NUM_FRAMES, copied, opened
 
+from uni4d_fg.frontend.sequence.model import ArrayFrames
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.results import chunks as chunks_module
 from uni4d_fg.results.chunks import chunks_of, even_order, spacing_of
@@ -94,6 +95,19 @@ def test_the_dense_cloud_is_the_static_scene_with_a_point_per_pixel(finished_run
     assert few is not None
     assert 500 < len(few.points) <= 2000
     assert RunClouds(run.with_parts(sequence=None), Limits()).dense_static() is None
+
+
+def test_where_next_to_nothing_is_sure_the_dense_cloud_is_the_surer_half(finished_run: Path) -> None:
+    run = opened(finished_run)
+    some = np.full((run.num_frames, *run.reconstruction.image_size), 0.05, np.float32)
+    some[:, :, ::2] = 0.12
+    everything, half = (
+        RunClouds(run.with_parts(confidence=ArrayFrames(part)), Limits()).dense_static()
+        for part in (np.ones_like(some), some)
+    )
+    assert everything is not None
+    assert half is not None
+    assert 0.4 * len(everything.points) < len(half.points) < 0.95 * len(everything.points)
 
 
 @settings(max_examples=25, deadline=None)

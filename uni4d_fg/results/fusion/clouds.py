@@ -68,7 +68,7 @@ def static_cloud(
     waiting = 0
     cameras = np.broadcast_to(intrinsics, (len(images), 4))
     frames = range(0, len(images), config.static_frame_stride)
-    least = 0.0 if confidence is None else _least_confidence(confidence, frames, config.cloud_confidence)
+    least = 0.0 if confidence is None else least_confidence(confidence, frames, config.cloud_confidence)
     for frame in frames:
         image, depth, mask = _maps(frame, images, depths, masks)
         keep = ~dilate(mask > 0, band_px) & ~depth_edges(depth, config.edge_relative_gradient)
@@ -82,8 +82,14 @@ def static_cloud(
     return merge_voxels(_concatenate(parts), config.static_voxel_m)
 
 
-def _least_confidence(confidence: FrameSource[Float32Array], frames: range, wanted: float) -> float:
-    """Return from which confidence on pixels are taken: the one that is wanted, if that leaves any to speak of."""
+def least_confidence(confidence: FrameSource[Float32Array], frames: range, wanted: float) -> float:
+    """Return from which confidence on pixels are taken: the one that is wanted, if that leaves any to speak of.
+
+    Args:
+        confidence: T maps (H, W).
+        frames: Those of which pixels are taken.
+        wanted: Of the config.
+    """
     some = [frames[place] for place in evenly_spread(len(frames), _SAMPLED_FRAMES).tolist()]
     sampled = np.concatenate([confidence[frame][::_SAMPLED, ::_SAMPLED].ravel() for frame in some])
     known = sampled[sampled > 0]

@@ -10,7 +10,7 @@ import numpy as np
 from uni4d_fg.arrays import Float32Array, ImageArray
 from uni4d_fg.config.stages import FusionConfig
 from uni4d_fg.frontend.sequence.model import FrameSource, Sequence, Video
-from uni4d_fg.results.fusion.clouds import Cloud, depth_edges, dilate, lift
+from uni4d_fg.results.fusion.clouds import Cloud, depth_edges, dilate, least_confidence, lift
 from uni4d_fg.slam.reconstruction import Reconstruction
 
 _BAND_PX = 5
@@ -74,12 +74,14 @@ def dense_static_cloud(
     """
     nothing = _Seen(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32))
     step = max(1, -(-result.num_frames // max_frames))
+    frames = range(0, result.num_frames, step)
+    least = 0.0 if confidence is None else least_confidence(confidence, frames, fusion.cloud_confidence)
     voxel = _footprint(depths, result)
     kept, waiting = nothing, nothing
-    for frame in range(0, result.num_frames, step):
+    for frame in frames:
         if should_stop():
             break
-        waiting = waiting.and_of(_lifted(sequence, depths, confidence, result, frame, fusion))
+        waiting = waiting.and_of(_lifted(sequence, depths, confidence, result, frame, fusion, least))
         if len(waiting.points) > _POINTS_BETWEEN_MERGES:
             kept, waiting = kept.and_of(waiting).nearest_per_voxel(voxel), nothing
     kept = kept.and_of(waiting).nearest_per_voxel(voxel)
@@ -96,11 +98,12 @@ def _lifted(
     result: Reconstruction,
     frame: int,
     fusion: FusionConfig,
+    least: float,
 ) -> _Seen:
     depth = depths[frame]
     keep = ~depth_edges(depth, fusion.edge_relative_gradient)
     if confidence is not None:
-        keep &= confidence[frame] >= fusion.cloud_confidence
+        keep &= confidence[frame] >= least
     if sequence.masks is not None:
         keep &= ~dilate(sequence.masks[frame] > 0, _BAND_PX)
     pose = result.world_T_cam[frame]
