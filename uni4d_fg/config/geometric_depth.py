@@ -37,7 +37,8 @@ class GeometricDepthConfig(Section):
     )
     min_angle_px: float = setting(
         1.5, "Where no cameras are found so, points whose rays meet at what so many pixels subtend take part: somebody "
-        "who stands and holds a camera in their hands moves it by little.", gt=0,
+        "who stands and holds a camera in their hands moves it by little. Where a camera pans they do from the "
+        "beginning.", gt=0,
     )  # fmt: skip
     growth: float = setting(
         1.3, "Bundle adjustment is repeated whenever the number of frames has grown by this factor.", gt=1

@@ -34,8 +34,6 @@ _DAMPING = 1e-6
 _SETTLING = 2
 """So many times more steps are taken without a zoom before the probe: what they leave is 1.5 % of the energy after as
 many, 0.9 % after twice as many."""
-_MISSED = 3.0
-"""Errors, in sigmas, are cut here where all tracks count."""
 _MAX_FRAMES = 120
 """Frames that cameras are compared on, at most: a focal length per frame makes the system of the cameras dense."""
 _SIGHTINGS = 4
@@ -97,13 +95,10 @@ class TrackJudge:
         return replace(fitted, scene=scene_of(fitted.camera.ideal_observations(self.real), fitted.scene))
 
     def cost(self, fitted: Fitted) -> float:
-        """Return the mean robust energy of all observations, those of tracks whose rays are parallel as well.
-
-        Errors are cut at a few sigmas: what moves can be made to fit wrong cameras better than the right ones.
-        """
+        """Return the mean robust energy of all observations, those of tracks whose rays are parallel as well."""
         ideal = fitted.camera.ideal_observations(self.real)
         size = fitted.camera.ideal_weight(ideal.uv, ideal.frame)
-        return energy_of_cameras(fitted.scene, ideal, self.sigma_px / np.sqrt(size), _MISSED)
+        return energy_of_cameras(fitted.scene, ideal, self.sigma_px / np.sqrt(size))
 
     def better(self, fitted: Fitted, rival: Fitted) -> tuple[float, float]:
         """Return by which part a camera lowers the energy of the tracks that both have a point of, and of how many."""

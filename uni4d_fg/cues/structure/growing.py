@@ -168,6 +168,11 @@ class GrowingScene:
         """Triangulate all tracks anew, those that are left out as well."""
         self.triangulate(np.ones(self.num_tracks, dtype=bool))
 
+    def seen_without_point(self) -> BoolArray:
+        """Return which tracks (M,) two cameras or more see that have no point all the same."""
+        seen = np.bincount(self.row[self.registered[self.observations.frame]], minlength=self.num_tracks)
+        return np.asarray((seen >= 2) & ~np.isfinite(self.position[:, 0]))
+
     def leave_out(self, tracks: BoolArray, limit_px: FloatArray) -> None:
         """Let tracks (M,) take no part in bundle adjustment, nor what is beyond limits (T,), px; points stay."""
         self.left_out, self.limit_px = tracks, limit_px

@@ -13,8 +13,8 @@ from uni4d_fg.cues.structure.triangulation import RayBundle, directions_far_away
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.slam.stages.observations import Observations
 
-_LOST = 100.0
-"""Errors, in sigmas, are cut here."""
+_MISSED = 3.0
+"""Errors, in sigmas, are cut here: what moves can be made to fit wrong cameras better than the right ones."""
 
 
 def held_out(observations: Observations, every: int) -> BoolArray:
@@ -65,26 +65,23 @@ def robust_energy(scene: GrowingScene, sigma_px: float) -> float:
     return energy_of_cameras(scene, scene.observations, np.full(len(scene.observations), sigma_px))
 
 
-def energy_of_cameras(
-    scene: GrowingScene, observations: Observations, sigma_px: FloatArray, lost: float = _LOST
-) -> float:
+def energy_of_cameras(scene: GrowingScene, observations: Observations, sigma_px: FloatArray) -> float:
     """Return the mean robust energy of observations in cameras, every track triangulated, however its rays meet.
 
     By how many points a scene has, the one of more parallax would win, be it as wrong as it may. What has no point in
-    front of the cameras counts as lost.
+    front of the cameras counts as missed.
 
     Args:
         scene: Its cameras; its points take no part.
         observations: N, of any tracks.
         sigma_px: Noise of each (N,).
-        lost: Where errors are cut, in sigmas.
     """
     used = scene.registered[observations.frame]
     seen, sigma_px = observations.select(used), sigma_px[used]
     tracks, row = seen.rows()
     rays = RayBundle(row, scene.world_T_cam, seen.frame, seen.uv, scene.intrinsics, len(tracks))
     error = triangulate(rays, scene.config.geometric_depth.triangulation_huber_px).errors_of(rays) / sigma_px
-    return float(np.log1p(np.fmin(error, lost) ** 2).mean())
+    return float(np.log1p(np.fmin(error, _MISSED) ** 2).mean())
 
 
 def errors_of(scene: GrowingScene, observations: Observations) -> FloatArray:

@@ -29,6 +29,7 @@ from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
 from uni4d_fg.cues.structure.rivals import NEARLY_AS_WELL, Rival, rivals_of
 from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.self_calibration import focal_of_pairs
+from uni4d_fg.cues.structure.sweep import view_sweep
 from uni4d_fg.cues.structure.triangulation import Points
 from uni4d_fg.cues.structure.trimming import trim, trim_and_converge
 from uni4d_fg.cues.structure.two_view import fit_rotation
@@ -45,6 +46,13 @@ _CLEAR_GAIN = 0.02
 k1 of -0.1 takes 0.8 to 2 %, -0.25 takes 13 %, and it is up to 1.1 % without a lens."""
 _HARDLY_TRIMMED = 0.8
 """Part of ``max_reprojection_px`` at which a limit that follows the noise is about where it began."""
+_SWEPT = 0.5
+"""Part of the picture by which its content moves on from which far points tell turns and focal length: 1.0 to 1.5 of
+pans, up to 0.36 of other clips. Where a view stays, they would let a thing that passes be the world."""
+_MOST_AGREE = 0.8
+"""Part of the tracks that agree with a scene below which something large that moves may have bent it: 0.59 to 0.78
+where somebody who sits in the middle of the picture has; 0.76 to 0.97 of scenes that are right, for which it costs a
+start that is not taken."""
 _SHARPER = 0.85
 """Part of a scene's sharpest errors that another one has, at most, for that to be taken: 0.48 and 0.82 where a scene is
 bent; 0.98 and more where both start alike."""
@@ -275,14 +283,16 @@ class _Search:
         """
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
-        found = self._grown(used, intrinsics, free_focal)
-        closer = with_smaller_angles(self.config, float(intrinsics[0]))
-        if found is None and closer != self.config:  # The camera may hardly move.
-            found = replace(self, config=closer)._grown(used, intrinsics, free_focal)
+        closer = replace(self, config=with_smaller_angles(self.config, float(intrinsics[0])))
+        sweeps = view_sweep(observations, self.num_frames, self.image_size) > _SWEPT
+        first = closer if sweeps else self
+        found = first._grown(used, intrinsics, free_focal)
+        if found is None and first.config != closer.config:  # The camera may hardly move.
+            found = closer._grown(used, intrinsics, free_focal)
         rest = None if found is None or is_trial else most_left_over(found.scene, used, self.image_size)
         if found is None or rest is None:
             return found
-        world = _if_solved(lambda: replace(self, start=None)._grown(rest, intrinsics, free_focal))
+        world = _if_solved(lambda: replace(first, start=None)._grown(rest, intrinsics, free_focal))
         if world is not None and explains_more(world.scene, found.scene, used, self.image_size):
             return replace(world, used=used)
         turns = only_seems_to_turn(rest, self.num_frames, intrinsics, settings, known_focal=not free_focal)
@@ -307,7 +317,7 @@ class _Search:
         if not hypotheses:
             return None
         scene, hypotheses = self._grown_best(competition, hypotheses, used)
-        if _is_bent(scene) and (side := competition.at_sides()) is not None:
+        if _may_be_bent(scene) and (side := competition.at_sides()) is not None:
             other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
             if other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, side.pair)]
@@ -344,6 +354,7 @@ class _Search:
         scene.prior_intrinsics = self.prior_intrinsics
         if of_some:
             trim(scene)
+            scene.leave_out(scene.left_out | scene.seen_without_point(), scene.limit_px)
         return self._grown_to_the_end(scene)
 
     def _continued(self, scene: GrowingScene, start: StartCameras, observations: Observations) -> GrowingScene:
@@ -444,9 +455,13 @@ def _sharpness(scene: GrowingScene, observations: Observations) -> float:
     return float(np.quantile(errors_of(scene.seeing(observations), observations), 0.25))
 
 
-def _is_bent(scene: GrowingScene) -> bool:
-    """Tell whether no majority agrees with a trimmed scene to much less than tracks may be off."""
-    return bool(np.median(scene.limit_px) >= _HARDLY_TRIMMED * scene.config.geometric_depth.max_reprojection_px)
+def _may_be_bent(scene: GrowingScene) -> bool:
+    """Tell whether no majority agrees with a trimmed scene to much less than tracks may be off, or many do not."""
+    agrees = np.isfinite(scene.position[:, 0]) & ~scene.left_out
+    limit_px = float(np.median(scene.limit_px))
+    if limit_px >= _HARDLY_TRIMMED * scene.config.geometric_depth.max_reprojection_px:
+        return True
+    return float(np.mean(agrees)) < _MOST_AGREE
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:

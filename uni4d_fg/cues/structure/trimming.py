@@ -40,12 +40,14 @@ def trim(scene: GrowingScene) -> None:
     """
     settings = scene.config.geometric_depth
     limit = scene.limit_px
+    counted = ~scene.left_out[scene.row]  # What is left out already says nothing of the noise of what is not.
     for _ in range(settings.trim_rounds):
         if not np.isfinite(scene.position).any():
             return
         error, before = scene.errors(), limit
-        limit = settings.trim_sigmas * _noise(scene, error)
+        limit = settings.trim_sigmas * _noise(scene, np.where(counted, error, np.inf))
         limit = np.clip(limit, settings.min_trim_px, settings.max_reprojection_px)
+        counted = np.ones_like(counted)
         left_out = _disagreeing(scene, error, limit)
         settled = float(np.abs(np.log(limit / before)).max()) < _SETTLED and not (left_out & ~scene.left_out).any()
         scene.leave_out(left_out, limit)
