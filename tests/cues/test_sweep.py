@@ -21,14 +21,16 @@ def test_a_turn_moves_the_view_by_its_angle(turn: float) -> None:
 def test_the_way_back_does_not_count_and_the_height_does() -> None:
     up_and_down = 0.5 * SIZE[0] * np.sin(np.linspace(0.0, 3 * np.pi, FRAMES))
     start = np.random.default_rng(0).uniform((0, 0), SIZE[::-1], (50, 2))
-    rows = [
+    rows: list[tuple[np.ndarray, ...]] = [
         (np.arange(50), np.full(50, frame), start + np.array([0.01 * frame, shift]))
         for frame, shift in enumerate(up_and_down)
     ]
-    assert view_sweep(observed(list(rows)), FRAMES, SIZE) == pytest.approx(1.0, abs=0.02)
+    assert view_sweep(observed(rows), FRAMES, SIZE) == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_walk_is_no_sweep_and_nothing_seen_twice_moves_nothing() -> None:
     assert view_sweep(tracked(sideways(FRAMES), 0).observations, FRAMES, SIZE) < 0.5
-    once = [(np.array([frame]), np.array([frame]), np.full((1, 2), 10.0)) for frame in range(3)]
-    assert view_sweep(observed(list(once)), 3, SIZE) == 0.0
+    once: list[tuple[np.ndarray, ...]] = [
+        (np.array([frame]), np.array([frame]), np.full((1, 2), 10.0)) for frame in range(3)
+    ]
+    assert view_sweep(observed(once), 3, SIZE) == 0.0

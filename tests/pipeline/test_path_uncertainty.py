@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from pipeline_scenes import TINY, make_config, make_scene
 
 from uni4d_fg.pipeline import fuse, reconstruct
-from uni4d_fg.pipeline.path_uncertainty import path_uncertainty, share_right
+from uni4d_fg.pipeline.fuse import share_right
+from uni4d_fg.pipeline.path_uncertainty import path_uncertainty
 from uni4d_fg.results.run_folder import RunFolder
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -24,7 +25,7 @@ from uni4d_fg.pipeline.control import BegunControl, with_moving
 from uni4d_fg.pipeline.dense_maps import DenseMaps
 from uni4d_fg.pipeline.fuse_parts import can_be_sent, fuse_in_parts
 from uni4d_fg.pipeline.fused_frames import fused_frames
-from uni4d_fg.pipeline.path_uncertainty import path_uncertainty, share_right
+from uni4d_fg.pipeline.path_uncertainty import path_uncertainty
 from uni4d_fg.pipeline.steps import Arrays
 from uni4d_fg.pipeline.window_workers import WindowWorkers
 from uni4d_fg.progress import Reporter
@@ -33,11 +34,14 @@ from uni4d_fg.results.depth_store import DepthWriter, write_depth
 from uni4d_fg.results.fusion.matching_size import finer_settings, matching_side
 from uni4d_fg.results.fusion.multiview.ideal_size import ideal_size
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingSize
+from uni4d_fg.results.fusion.static_depth import probability_right
 from uni4d_fg.results.fusion.told_error import ToldError
 from uni4d_fg.results.run_folder import RunFolder
 from uni4d_fg.slam.reconstruction import zoomed
 
 _STOPPED = "stopped during fusion; finished stages are kept, --resume continues from them"
+_LEAST_SHARE = 0.1
+"""However bad the path: so that of pixels the surer ones can still be told, in the 8 bits that confidence has."""
 
 
 def fuse_depth(
@@ -142,6 +146,15 @@ def _note(
     if sure is not None and confidence is not None:
         sure.write_steps(np.rint(right * confidence).astype(np.uint8))
         told.follow(of_frame)
+
+
+def share_right(uncertainty: float) -> float:
+    """Return the probability that depth is right to 3 % as far as the path goes, whose uncertainty this is.
+
+    Triangulated depth is off by the same part as the distance between the cameras that saw it. 1 where nothing is
+    known.
+    """
+    return 1.0 if math.isnan(uncertainty) else max(float(probability_right(np.float32(uncertainty))), _LEAST_SHARE)
 
 
 def _unmatchable(

@@ -177,7 +177,8 @@ def structure_from_motion(
     free_focal = config.input.intrinsics == "free"
     if should_stop():
         raise Cancelled("structure from motion stopped")
-    search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop, start)
+    sweeps = view_sweep(observations, num_frames, image_size) > _SWEPT
+    search = _Search(num_frames, image_size, intrinsics, config, reporter, should_stop, sweeps, start)
     if any_camera and camera is not None and camera.zoom is not None:
         camera = camera if search.needs_zoom(observations, intrinsics, blur_px) else None
     known, seen = camera, observations
@@ -272,6 +273,8 @@ class _Search:
     config: Config
     reporter: Reporter
     should_stop: Callable[[], bool]
+    sweeps: bool
+    """Whether the view moves on, see :data:`_SWEPT`."""
     start: StartCameras | None = None
 
     def grow(
@@ -284,8 +287,7 @@ class _Search:
         settings = self.config.geometric_depth
         used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
         closer = replace(self, config=with_smaller_angles(self.config, float(intrinsics[0])))
-        sweeps = view_sweep(observations, self.num_frames, self.image_size) > _SWEPT
-        first = closer if sweeps else self
+        first = closer if self.sweeps else self
         found = first._grown(used, intrinsics, free_focal)
         if found is None and first.config != closer.config:  # The camera may hardly move.
             found = closer._grown(used, intrinsics, free_focal)
@@ -458,10 +460,8 @@ def _sharpness(scene: GrowingScene, observations: Observations) -> float:
 def _may_be_bent(scene: GrowingScene) -> bool:
     """Tell whether no majority agrees with a trimmed scene to much less than tracks may be off, or many do not."""
     agrees = np.isfinite(scene.position[:, 0]) & ~scene.left_out
-    limit_px = float(np.median(scene.limit_px))
-    if limit_px >= _HARDLY_TRIMMED * scene.config.geometric_depth.max_reprojection_px:
-        return True
-    return float(np.mean(agrees)) < _MOST_AGREE
+    blunt_px = _HARDLY_TRIMMED * scene.config.geometric_depth.max_reprojection_px
+    return bool(np.median(scene.limit_px) >= blunt_px or np.mean(agrees) < _MOST_AGREE)
 
 
 def only_turns(scene: GrowingScene, used: Observations) -> bool:
