@@ -15,7 +15,7 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.start_doubts import start_doubts
-from uni4d_fg.cues.structure import camera_search, motion, zoom_search
+from uni4d_fg.cues.structure import camera_search, motion, search, zoom_search
 from uni4d_fg.cues.structure.camera_fit import Fitted
 from uni4d_fg.cues.structure.camera_search import FoundCamera, is_lens
 from uni4d_fg.cues.structure.growing import GrowingScene
@@ -58,13 +58,13 @@ def test_cameras_are_grown_anew_only_where_those_at_hand_may_hide_a_zoom(
     zoom: float, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = list[int]()
-    trial = motion._Search.trial
+    trial = search.Search.trial
 
-    def counted(self: motion._Search, *arguments: Any) -> GrowingScene | None:
+    def counted(self: search.Search, *arguments: Any) -> GrowingScene | None:
         calls.append(1)
         return trial(self, *arguments)
 
-    monkeypatch.setattr(motion._Search, "trial", counted)
+    monkeypatch.setattr(search.Search, "trial", counted)
     monkeypatch.setattr(camera_search, "asks_for_zoom", lambda *_: True)
     found = structure(through(tracked(sideways(FRAMES), points=1500), CameraModel(K, zoom=ramp(zoom))))
     assert len(calls) == count
@@ -149,7 +149,7 @@ def test_a_lens_is_not_believed_where_the_focal_length_is_open_unless_it_explain
 ) -> None:
     lens = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.12,)))
     monkeypatch.setattr(motion, "find_camera", lambda *_: FoundCamera(lens, gain))
-    scene = through(tracked(path(FRAMES)), lens)
+    scene = through(tracked(path(FRAMES), points=1500), lens)
     found = structure(scene)
     assert found.focal.is_wide is (path is forward)
     assert found.camera.lens.is_pinhole is not is_told
@@ -184,7 +184,7 @@ def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
 ) -> None:
     lens = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
     monkeypatch.setattr(motion, "find_camera", lambda *_: FoundCamera(lens, 0.02))
-    monkeypatch.setattr(motion, "rivals_of", lambda *_: [Rival(2, 9, apart * K[0], 0.1, 0.2, 0.01)])
+    monkeypatch.setattr(search, "rivals_of", lambda *_: [Rival(2, 9, apart * K[0], 0.1, 0.2, 0.01)])
     scene = through(tracked(sideways(FRAMES)), lens)
     found = structure(scene)
     assert found.camera.lens.is_pinhole is not is_told

@@ -10,7 +10,7 @@ import pytest
 from cues.start_scenes import GUESS, SIZE, K, observed
 
 from uni4d_fg.config.load import load_config
-from uni4d_fg.cues.structure import motion
+from uni4d_fg.cues.structure import search
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import structure_from_motion
 from uni4d_fg.cues.structure.passing_thing import explains_more, most_left_over, only_seems_to_turn
@@ -115,13 +115,13 @@ def test_what_a_thing_leaves_over_is_the_world_if_it_explains_more(monkeypatch: 
     of_bus, of_street = (scene_at(street, poses) for poses in (street.bus_T_cam, street.world_T_cam))
     assert explains_more(of_street, of_bus, street.observations, SIZE)
     assert not explains_more(of_bus, of_street, street.observations, SIZE)
-    grown = motion._Search._grown
+    grown = search.Search._grown
 
-    def bus_first(search: motion._Search, used: Observations, intrinsics: np.ndarray, free: bool) -> object:
-        found = grown(search, used, intrinsics, free)
+    def bus_first(one: search.Search, used: Observations, intrinsics: np.ndarray, free: bool) -> object:
+        found = grown(one, used, intrinsics, free)
         return found if found is None or len(used) < len(street.observations) else replace(found, scene=of_bus)
 
-    monkeypatch.setattr(motion._Search, "_grown", bus_first)
+    monkeypatch.setattr(search.Search, "_grown", bus_first)
     config = load_config("default", ["input.intrinsics=fixed", f"geometric_depth.max_tracks={10**6}"])
     found = structure_from_motion(street.observations, FRAMES, SIZE, K, config, SilentReporter(), lambda: False)
     assert found is not None
@@ -132,15 +132,15 @@ def test_what_a_thing_leaves_over_is_the_world_if_it_explains_more(monkeypatch: 
 
 def test_a_rest_that_cannot_be_solved_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     street = passing(0, sway=0.8)
-    grown = motion._Search._grown
+    grown = search.Search._grown
 
-    def failing(search: motion._Search, used: Observations, intrinsics: np.ndarray, free: bool) -> object:
+    def failing(one: search.Search, used: Observations, intrinsics: np.ndarray, free: bool) -> object:
         if len(used) < len(street.observations):
             raise SolverError("singular")
-        return grown(search, used, intrinsics, free)
+        return grown(one, used, intrinsics, free)
 
-    monkeypatch.setattr(motion._Search, "_grown", failing)
-    monkeypatch.setattr(motion, "most_left_over", lambda scene, used, size: used.select(used.frame < FRAMES - 1))
+    monkeypatch.setattr(search.Search, "_grown", failing)
+    monkeypatch.setattr(search, "most_left_over", lambda scene, used, size: used.select(used.frame < FRAMES - 1))
     config = load_config("default", [f"geometric_depth.max_tracks={10**6}"])
     assert structure_from_motion(street.observations, FRAMES, SIZE, GUESS, config, SilentReporter(), lambda: False)
 
@@ -153,8 +153,8 @@ def test_without_another_scene_the_camera_only_turns(monkeypatch: pytest.MonkeyP
         return structure_from_motion(street.observations, FRAMES, SIZE, GUESS, CONFIG, SilentReporter(), lambda: False)
 
     assert found() is not None
-    monkeypatch.setattr(motion, "most_left_over", lambda scene, used, size: used)
-    monkeypatch.setattr(motion, "explains_more", lambda *_: False)
+    monkeypatch.setattr(search, "most_left_over", lambda scene, used, size: used)
+    monkeypatch.setattr(search, "explains_more", lambda *_: False)
     assert found() is not None
-    monkeypatch.setattr(motion, "only_seems_to_turn", lambda *_, **__: True)
+    monkeypatch.setattr(search, "only_seems_to_turn", lambda *_, **__: True)
     assert found() is None

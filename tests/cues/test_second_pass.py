@@ -12,7 +12,7 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.cues import gather
 from uni4d_fg.cues.geometric_depth import GeometricDepth
 from uni4d_fg.cues.plan import plan_cues
-from uni4d_fg.cues.structure.motion import StartCameras
+from uni4d_fg.cues.structure.search import StartCameras
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.lens import Lens

@@ -91,7 +91,7 @@ class GeometricDepthConfig(Section):
     retries: int = setting(1, "How often frames that fit badly are taken out and posed again.", ge=0)
     trim_sigmas: float = setting(
         2.5, "Cameras are refined from the tracks of which most observations agree within this many times the noise "
-        "of all, at most max_reprojection_px.", gt=0,
+        "of those that agree, at most max_reprojection_px.", gt=0,
     )  # fmt: skip
     stage_trim_sigmas: float = setting(
         3.0, "Takes the place of bundle_adjustment.trim_sigmas where the intrinsics are from camera motion.", gt=0

@@ -21,7 +21,7 @@ from uni4d_fg.cues.network_makers import NetworkDepth, network_depth, network_ma
 from uni4d_fg.cues.plan import GUESSED, CuePlan, CueReport
 from uni4d_fg.cues.scale_notes import NOT_METRIC, NOT_METRIC_GIVEN, NOT_METRIC_RELATIVE
 from uni4d_fg.cues.start_doubts import doubts_of_masks
-from uni4d_fg.cues.structure.motion import StartCameras
+from uni4d_fg.cues.structure.search import StartCameras
 from uni4d_fg.errors import ConfigError
 from uni4d_fg.frontend.sequence.assemble import as_sequence
 from uni4d_fg.frontend.sequence.bars import without_bars

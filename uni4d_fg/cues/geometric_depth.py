@@ -31,13 +31,13 @@ from uni4d_fg.cues.interpolated_depth import (
 from uni4d_fg.cues.moving_things import Sightings, place_moving
 from uni4d_fg.cues.start_doubts import start_doubts, start_summary
 from uni4d_fg.cues.structure.motion import (
-    StartCameras,
     Structure,
     observations_of_tracks,
     rotations_only,
     structure_from_motion,
 )
 from uni4d_fg.cues.structure.rotation_focal import focal_of_rotations
+from uni4d_fg.cues.structure.search import StartCameras
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.calibration import unusual_focal

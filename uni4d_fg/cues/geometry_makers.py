@@ -19,7 +19,7 @@ from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
 from uni4d_fg.cues.interpolated_depth import GridDepths, InterpolatedDepths
 from uni4d_fg.cues.motion_masks import motion_masks
 from uni4d_fg.cues.network_makers import labels_are_stored, open_labels, store_labels, store_maps
-from uni4d_fg.cues.structure.motion import StartCameras
+from uni4d_fg.cues.structure.search import StartCameras
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import MaskFolder

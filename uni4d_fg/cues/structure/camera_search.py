@@ -7,7 +7,8 @@ is found another camera is looked for.
 
 A lens bends the cameras little, so that its search starts from them. Bundle adjustment with a lens goes part of the way
 only, as the tracks that agree with a pinhole are those that a lens bends least; with tracks judged and triangulated
-anew, two or three rounds end at the lens, from a focal length of twice its own (k1 of -0.25), too.
+anew, two or three rounds end at the lens, from a focal length of twice its own (k1 of -0.25), too. Only the cameras of
+a pan are bent farther than that: what pairs of frames tell of a lens, before any camera is known, is tried as well.
 
 A zoom takes all cameras along; it is looked for in :mod:`uni4d_fg.cues.structure.zoom_search`.
 """
@@ -21,7 +22,9 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, part_of, probing
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens
+from uni4d_fg.cues.structure.lens_of_pairs import lens_of_pairs
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
+from uni4d_fg.cues.structure.sweep import sweeps
 from uni4d_fg.cues.structure.zoom_search import (
     Grown,
     asks_for_zoom,
@@ -63,6 +66,8 @@ class FoundCamera:
     """Part of the reprojection energy that a lens takes away, if one was looked for."""
     open_focal: tuple[float, ...] = ()
     """Shortest and longest focal length, px, of a zoom that explains all tracks better, but not most of them."""
+    told: CameraModel | None = None
+    """The lens that pairs of frames tell, where the found one was refined from that."""
     denied_px: float = 0.0
     """How far distortion that explains the tracks better, but that is no lens in all of them, moves a pixel at most."""
 
@@ -99,15 +104,18 @@ def find_camera(
     if proposed is not None and proposed.zoom is None:
         proposed = None
     similar = similar_zoom(scene, image_size) if asks_for_zoom(plain, config) else None
+    told = _told_by_pairs(plain, real, image_size, config) if settings.model == "auto" else None
     asks_for_lens = settings.model == "auto" and (
-        fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
+        told is not None or fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
     if proposed is None and similar is None and not asks_for_lens:
         return None
     judge = TrackJudge(part.observations, config.bundle_adjustment.reprojection_sigma_px)
     best, gain, open_focal, denied_px = plain, 0.0, tuple[float, ...](), 0.0
     if asks_for_lens:
-        lens = _find_lens(plain, judge, config)
+        lens = None if told is None else _grown_with(told, plain, judge, real, config, grown)
+        if lens is None or judge.better(lens, plain)[0] <= 0.0:
+            lens, told = _refined(plain, judge, config), None
         gain = judge.better(lens, plain)[0]
         is_beyond = lens_strength(lens.camera, image_size, config) is Strength.BEYOND
         if is_lens(lens.camera, image_size, gain, config) and halves_agree_on_lens(lens, image_size, config):
@@ -125,7 +133,8 @@ def find_camera(
                 open_focal = focal_range(zoom)
     if best is plain and not open_focal and denied_px == 0.0:
         return None
-    return FoundCamera(best.camera, gain, open_focal, denied_px if best is plain else 0.0)
+    told = told if best.camera.zoom is None else None
+    return FoundCamera(best.camera, gain, open_focal, told, denied_px if best is plain else 0.0)
 
 
 def needs_zoom(scene: GrowingScene, config: Config, blur_px: Float32Array | None = None) -> bool:
@@ -154,8 +163,18 @@ def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, confi
     return gain >= config.camera.min_evidence_unsure if strength is Strength.WEAK else gain > 0.0
 
 
-def _find_lens(plain: Fitted, judge: TrackJudge, config: Config) -> Fitted:
-    """Fit a radial lens, and from there once more with near and far exchanged."""
+def _told_by_pairs(
+    plain: Fitted, real: Observations, image_size: tuple[int, int], config: Config
+) -> CameraModel | None:
+    """Return the lens that pairs of frames tell of a pan, whose cameras are bent too far to ask for it, or None."""
+    num_frames = len(plain.scene.registered)
+    if not sweeps(real, num_frames, image_size):
+        return None
+    return lens_of_pairs(real, num_frames, image_size, plain.camera.intrinsics, config.geometric_depth)
+
+
+def _refined(plain: Fitted, judge: TrackJudge, config: Config) -> Fitted:
+    """Fit a radial lens to the cameras of a pinhole, and from there once more with near and far exchanged."""
     found = _with_lens(plain, plain, judge, config)
     other = exchanged_and_refined(found.scene)
     # With a lens that is not its own the right scene explains less, but what it explains it explains better.
@@ -166,6 +185,21 @@ def _find_lens(plain: Fitted, judge: TrackJudge, config: Config) -> Fitted:
     except SolverError:
         return found
     return mirrored if judge.better(mirrored, found)[0] > 0.0 else found
+
+
+def _grown_with(
+    told: CameraModel, plain: Fitted, judge: TrackJudge, real: Observations, config: Config, grown: Grown
+) -> Fitted | None:
+    """Return the lens that a scene leads to which is grown with one that was told; None where nothing grows."""
+    scene = grown(told.ideal_observations(real), told.intrinsics)
+    if scene is None:
+        return None
+    part = part_of(scene, config.camera.observations, plain.scene.registered)
+    part.free_focal = plain.scene.free_focal
+    try:
+        return _with_lens(judge.anew(Fitted(told, part)), plain, judge, config)
+    except SolverError:
+        return None
 
 
 def _with_lens(found: Fitted, rival: Fitted, judge: TrackJudge, config: Config) -> Fitted:

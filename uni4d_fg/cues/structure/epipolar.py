@@ -34,6 +34,8 @@ class EpipolarGeometry:
     """(M,) tracks that disagree with it in most of the pairs of frames that see them."""
     fundamental: FloatArray
     """(P, 3, 3) fundamental matrices of the pairs, from pixels of the earlier frame to lines in the later one."""
+    left_px: float
+    """Median distance of what pairs of frames share from it, px; NaN without pairs."""
 
 
 def epipolar_geometry(
@@ -58,21 +60,23 @@ def epipolar_geometry(
         for first in range(0, num_frames - step, max(1, step // 2, (num_frames - step) // _PAIRS_PER_STEP))
     ]
 
-    def agreement(pair: tuple[int, int]) -> tuple[IntArray, BoolArray, FloatArray] | None:
+    def agreement(pair: tuple[int, int]) -> tuple[IntArray, FloatArray, FloatArray] | None:
         a, b = common.between(*pair)
         matrix = _agreed_on(observations.uv[a], observations.uv[b], cell[a], config)
         if matrix is None:
             return None
-        return row[a], _distances(matrix, observations.uv[a], observations.uv[b]) <= config.epipolar_px, matrix
+        return row[a], _distances(matrix, observations.uv[a], observations.uv[b]), matrix
 
-    matrices = []
+    matrices, distances = [], []
     for found in map_in_order(agreement, pairs, thread_count()):
         if found is not None:
             tested[found[0]] += 1
-            agreed[found[0]] += found[1]
+            agreed[found[0]] += found[1] <= config.epipolar_px
+            distances.append(found[1])
             matrices.append(found[2])
     outlier = np.asarray((tested > 0) & (agreed < 0.5 * tested))
-    return EpipolarGeometry(outlier, np.array(matrices).reshape(-1, 3, 3))
+    left_px = float(np.median(np.concatenate(distances))) if distances else float("nan")
+    return EpipolarGeometry(outlier, np.array(matrices).reshape(-1, 3, 3), left_px)
 
 
 def _agreed_on(

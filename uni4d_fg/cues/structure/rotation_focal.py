@@ -16,7 +16,7 @@ import numpy as np
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.structure.first_pair import common_pixels
-from uni4d_fg.cues.structure.self_calibration import AGREED, MIN_VOTES
+from uni4d_fg.cues.structure.self_calibration import AGREED, MIN_VOTES, least_of
 from uni4d_fg.cues.structure.two_view import left_by_rotations, multiples
 from uni4d_fg.slam.stages.observations import Observations
 
@@ -70,13 +70,5 @@ def focal_of_rotations(
     lower, upper = np.quantile(votes, [0.25, 0.75])
     if upper - lower > np.log(AGREED):
         return None
-    focal = float(np.exp(_least(np.log(_FOCALS), log_left[clear].mean(axis=0))) * longer)
+    focal = float(np.exp(least_of(np.log(_FOCALS), log_left[clear].mean(axis=0))) * longer)
     return RotationFocal(focal, max(0.5 * float(upper - lower), _LEAST_SIGMA))
-
-
-def _least(x: FloatArray, y: FloatArray) -> float:
-    """Return where the parabola through the least of evenly spaced values and those beside it is least."""
-    at = int(np.clip(np.argmin(y), 1, len(y) - 2))
-    bend = y[at - 1] - 2.0 * y[at] + y[at + 1]
-    shift = 0.5 * (y[at - 1] - y[at + 1]) / bend if bend > 0.0 else 0.0
-    return float(x[at] + np.clip(shift, -0.5, 0.5) * (x[1] - x[0]))

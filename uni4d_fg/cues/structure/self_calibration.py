@@ -57,3 +57,11 @@ def focal_of_pairs(
         return None
     low, middle, high = np.quantile(focal[told], [0.25, 0.5, 0.75])
     return FocalGuess(float(middle), bool(high <= AGREED * low))
+
+
+def least_of(x: FloatArray, y: FloatArray) -> float:
+    """Return where the parabola through the least of evenly spaced values and those beside it is least."""
+    at = int(np.clip(np.argmin(y), 1, len(y) - 2))
+    bend = y[at - 1] - 2.0 * y[at] + y[at + 1]
+    shift = 0.5 * (y[at - 1] - y[at + 1]) / bend if bend > 0.0 else 0.0
+    return float(x[at] + np.clip(shift, -0.5, 0.5) * (x[1] - x[0]))

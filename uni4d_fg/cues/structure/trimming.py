@@ -2,11 +2,12 @@
 
 A thing that moves by little between frames, or along its epipolar lines, passes limits of pixels, and a convex kernel
 lets it bend the cameras. Its tracks depart from a rigid scene more than the others all the same. So the limit is
-lowered with the median residual, tracks are judged, and bundle adjustment is repeated with those that agree, until the
-limit stays: least trimmed squares (P. Rousseeuw, "Least median of squares regression", 1984), for which more than half
-of the observations must be of what stands still. Tracks that were left out are triangulated and judged again in every
-round. The limit is low, so that the cameras come loose from what bends them; in the end it is doubled, and tracks
-that agree within that come back: those that a lens or a rolling shutter displaces a little are not to be missed.
+lowered with the median residual of what agrees, tracks are judged, and bundle adjustment is repeated with those that
+agree, until the limit stays: least trimmed squares (P. Rousseeuw, "Least median of squares regression", 1984), for
+which more than half of the observations must be of what stands still. Tracks that were left out are triangulated and
+judged again in every round. The limit is low, so that the cameras come loose from what bends them, and they converge
+with what is within it. Only then it is widened to twice that of all tracks, and those that agree within that come back:
+what a lens or a rolling shutter displaces a little is not to be missed, but it has no say in a focal length either.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _MOST = 0.5
 def trim(scene: GrowingScene) -> None:
     """Refine a grown scene from the tracks that agree with it within a limit that follows their noise.
 
-    Afterwards ``scene.limit_px`` is that limit, and ``scene.left_out`` (M,) the tracks that do not agree.
+    Afterwards ``scene.limit_px`` is the wide limit, and ``scene.left_out`` (M,) the tracks that do not agree within it.
 
     Args:
         scene: Grown.
@@ -38,16 +39,37 @@ def trim(scene: GrowingScene) -> None:
         Cancelled: If asked to stop.
         SolverError: If bundle adjustment fails.
     """
+    _tighten(scene)
+    _widen(scene)
+
+
+def trim_and_converge(scene: GrowingScene) -> None:
+    """Trim a grown scene, and refine it with the tracks that agree, and their noise, until it tells a focal length.
+
+    Tracks that the wide limit lets in again take no part in that; of those that agree all observations within it do.
+
+    Raises:
+        Cancelled: If asked to stop.
+        SolverError: If bundle adjustment fails.
+    """
+    _tighten(scene)
+    scene.leave_out(scene.left_out, _widened(scene, scene.limit_px))
+    scene.measure_noise()
+    scene.converge()
+    scene.triangulate_all()
+    _widen(scene)
+    scene.measure_noise()
+
+
+def _tighten(scene: GrowingScene) -> None:
+    """Lower the limit, and refine from the tracks that agree, until it stays."""
     settings = scene.config.geometric_depth
     limit = scene.limit_px
-    counted = ~scene.left_out[scene.row]  # What is left out already says nothing of the noise of what is not.
     for _ in range(settings.trim_rounds):
         if not np.isfinite(scene.position).any():
             return
         error, before = scene.errors(), limit
-        limit = settings.trim_sigmas * _noise(scene, np.where(counted, error, np.inf))
-        limit = np.clip(limit, settings.min_trim_px, settings.max_reprojection_px)
-        counted = np.ones_like(counted)
+        limit = _limit(scene, np.where(scene.left_out[scene.row], np.inf, error))
         left_out = _disagreeing(scene, error, limit)
         settled = float(np.abs(np.log(limit / before)).max()) < _SETTLED and not (left_out & ~scene.left_out).any()
         scene.leave_out(left_out, limit)
@@ -56,20 +78,27 @@ def trim(scene: GrowingScene) -> None:
         scene.measure_noise()
         scene.adjust()
         scene.triangulate_all()
-    limit = np.minimum(_WIDEN * limit, settings.max_reprojection_px)
-    scene.leave_out(_disagreeing(scene, scene.errors(), limit), limit)
 
 
-def trim_and_converge(scene: GrowingScene) -> None:
-    """Trim a grown scene, and refine it with what is left and its noise until it tells a focal length.
+def _widen(scene: GrowingScene) -> None:
+    """Let tracks come back that agree within twice the limit of all of them, not of those that agree already."""
+    if not np.isfinite(scene.position).any():
+        return
+    error = scene.errors()
+    limit = _widened(scene, _limit(scene, error))
+    scene.leave_out(_disagreeing(scene, error, limit), limit)
 
-    Raises:
-        Cancelled: If asked to stop.
-        SolverError: If bundle adjustment fails.
-    """
-    trim(scene)
-    scene.measure_noise()
-    scene.converge()
+
+def _limit(scene: GrowingScene, error: FloatArray) -> FloatArray:
+    """Return the limits (T,), px, of errors (N,) that follow their noise."""
+    settings = scene.config.geometric_depth
+    limit = settings.trim_sigmas * _noise(scene, error)
+    return np.asarray(np.clip(limit, settings.min_trim_px, settings.max_reprojection_px))
+
+
+def _widened(scene: GrowingScene, limit_px: FloatArray) -> FloatArray:
+    """Return wide limits (T,), px, for those (T,) by which tracks were found to agree."""
+    return np.asarray(np.minimum(_WIDEN * limit_px, scene.config.geometric_depth.max_reprojection_px))
 
 
 def _noise(scene: GrowingScene, error: FloatArray) -> FloatArray:
