@@ -263,3 +263,15 @@ def test_a_foot_or_a_shadow_at_the_lower_border_cuts_nothing_off(width: int, is_
     for _ in range(5):  # what is left of a mask while the thing comes and goes
         seen.add(0, remnant)
     assert seen.is_cut(2) == is_cut
+
+
+def test_what_stands_by_a_thing_that_is_cut_off_is_cut_off_as_well() -> None:
+    tracks = Tracks(np.zeros((1, 2, 2), np.float32), np.zeros((1, 2), dtype=bool), np.zeros(1, dtype=np.int32))
+    sightings = Sightings(tracks)
+    mask = np.zeros((60, 40), np.int32)
+    mask[10:30, 10:30], mask[30:, 12:28] = 1, 2
+    for frame in range(2):
+        sightings.add(frame, mask)
+    assert (sightings.is_cut(1), sightings.is_cut(2)) == (False, True)
+    sightings.stand_by([{1: 2, 2: 2}, {1: 2, 2: 2}])
+    assert (sightings.is_cut(1), sightings.is_cut(2)) == (True, True)

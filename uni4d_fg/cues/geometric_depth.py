@@ -29,6 +29,7 @@ from uni4d_fg.cues.interpolated_depth import (
     supported,
 )
 from uni4d_fg.cues.moving_things import Sightings, place_moving
+from uni4d_fg.cues.parts_of_things import feet_of, things_below
 from uni4d_fg.cues.start_doubts import start_doubts, start_summary
 from uni4d_fg.cues.structure.motion import (
     Structure,
@@ -323,16 +324,21 @@ def _place(
     """Put what the masks mark where it stands, or where its motion shows it to be nearer; return facts and warnings."""
     if video.masks is None:
         return depths, [], []
-    standing, grids = [], []
+    standing, below, grids = [], [], []
     sightings = Sightings(tracks)
     reporter.begin("depth of moving things", video.num_frames)
     for frame, grid in enumerate(depths.all_grids(reporter, should_stop)):
         mask = video.masks[frame]
         standing.append(ground_contact(mask, enlarged(grid, video.image_size), depths.config))
+        below.append(things_below(mask, depths.config.contact_fraction))
         sightings.add(frame, mask)
         grids.append(grid)
     reporter.end()
     depths = replace(depths, grids=tuple(grids))
+    feet = feet_of(below, sightings.area)
+    sightings.stand_by(feet)
+    by_feet = zip(standing, feet, strict=True)
+    standing = [{label: here[foot] for label, foot in foot_of.items()} for here, foot_of in by_feet]
     contacts = smooth_over_time(standing, depths.config.contact_smoothing)
     ideal = structure.camera.ideal_tracks(tracks)
     still = ~structure.moving

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.cues.ground_plane import Ground
 from uni4d_fg.cues.triangle_grid import linear_on_grid
@@ -190,15 +190,23 @@ def ground_contact(mask: Int32Array, inverse: Float32Array, config: GeometricDep
     """
     out: dict[int, float] = {}
     for label in np.unique(mask[mask > 0]).tolist():
-        mine = mask == label
-        lines = np.flatnonzero(mine.any(axis=1))
-        height = int(np.ceil(config.contact_fraction * (lines[-1] - lines[0] + 1)))
-        lowest = mine[lines[-1] - height + 1 : lines[-1] + 1]
-        columns = np.flatnonzero(lowest.any(axis=0))
-        # The lowest pixel of each column in that part.
-        line = lines[-1] - np.argmax(lowest[::-1, columns], axis=0)
+        line, columns = lowest_part(mask == label, config.contact_fraction)
         out[int(label)] = float(np.median(inverse[line, columns]))
     return out
+
+
+def lowest_part(mine: BoolArray, fraction: float) -> tuple[IntArray, IntArray]:
+    """Return the lowest pixel (lines, columns) of each column of the lowest part of a thing.
+
+    Args:
+        mine: (H, W) where the thing is.
+        fraction: Of its height.
+    """
+    lines = np.flatnonzero(mine.any(axis=1))
+    height = int(np.ceil(fraction * (lines[-1] - lines[0] + 1)))
+    lowest = mine[lines[-1] - height + 1 : lines[-1] + 1]
+    columns = np.flatnonzero(lowest.any(axis=0))
+    return lines[-1] - np.argmax(lowest[::-1, columns], axis=0), columns
 
 
 def smooth_over_time(standing: list[dict[int, float]], window: int) -> tuple[dict[int, float], ...]:

@@ -11,7 +11,7 @@ factor that only the camera's own motion may show (``moving_parallax.py``). Both
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -71,6 +71,13 @@ class Sightings:
             cut_in = self.cut_in.setdefault(label, set())
             if width[-1] > _CUT_WIDTH * width.max():
                 cut_in.add(frame)
+
+    def stand_by(self, feet: Sequence[Mapping[int, int]]) -> None:
+        """Take things that stand by others (T: by id) as cut off where those are."""
+        for frame, foot_of in enumerate(feet):
+            for label, foot in foot_of.items():
+                if frame in self.cut_in[foot]:
+                    self.cut_in[label].add(frame)
 
     def is_cut(self, label: int) -> bool:
         """Tell whether the image cuts a thing off in most of what it shows of it.

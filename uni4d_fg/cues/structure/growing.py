@@ -37,9 +37,6 @@ from uni4d_fg.slam.stages.scene import StaticNoise
 
 _FOCAL_STEP = 0.15
 """Step of log f that cameras and points can follow."""
-_REDESCENDING = KernelConfig(kind="cauchy", threshold=1.0)
-"""Of the last refinement, in standard deviations. Where noise is Gaussian paths err by 12 % more than with twice the
-threshold; focal lengths of rendered worlds, by what a tracker follows, err by a fifth less."""
 
 
 @dataclass
@@ -203,7 +200,7 @@ class GrowingScene:
         Observations that err by more than the noise have less of a say, the less the more they do: near where surfaces
         end they err to one side, which a convex kernel lets bend the focal lengths.
         """
-        stage, state, frames, rows = self.bundle(kernel=_REDESCENDING)
+        stage, state, frames, rows = self.bundle(kernel=self.config.geometric_depth.stage_kernel)
         self._take(self._solve(until_converged(stage), state), frames, rows)
 
     def _solve(self, stage: Stage, state: State) -> State:
