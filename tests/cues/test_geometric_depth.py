@@ -225,7 +225,6 @@ def test_behind_the_lens_what_motion_told_is_no_cue_for_the_cameras() -> None:
     stages = settings_behind_lens(config, seen, depth_is_needed=False)
     assert (stages.input.intrinsics, stages.bundle_adjustment.depth_prior) == ("fixed", False)
     assert stages.bundle_adjustment.trim_sigmas == config.geometric_depth.stage_trim_sigmas
-    assert stages.bundle_adjustment.reprojection_kernel == config.geometric_depth.stage_kernel
     needed = settings_behind_lens(config, seen, depth_is_needed=True)
     assert (needed.input.intrinsics, needed.bundle_adjustment.depth_prior) == ("fixed", True)
     asked = settings_behind_lens(

@@ -100,7 +100,7 @@ def test_a_search_that_cannot_be_solved_leaves_the_scene_as_it_is(monkeypatch: p
         raise SolverError("singular")
 
     scene = read_by(Readout(0.5))
-    monkeypatch.setattr("uni4d_fg.cues.structure.motion.find_readout", fails)
+    monkeypatch.setattr("uni4d_fg.cues.structure.search.find_readout", fails)
     structure, _ = found(scene)
     assert structure.readout is None
     plain, _ = found(scene, any_camera=False)
@@ -119,7 +119,7 @@ def test_a_readout_is_asked_for_again_with_tracks_that_were_moved(
 
     scene = read_by(Readout(true))
     moved = at_one_time(scene.observations, readout, SIZE)
-    monkeypatch.setattr("uni4d_fg.cues.structure.motion.find_readout", taken)
+    monkeypatch.setattr("uni4d_fg.cues.structure.search.find_readout", taken)
     found(replace(scene, observations=moved))
     assert is_told_still(grown[0], moved, readout, SIZE) == is_told
 

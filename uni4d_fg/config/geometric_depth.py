@@ -97,10 +97,9 @@ class GeometricDepthConfig(Section):
     stage_trim_sigmas: float = setting(
         3.0, "Takes the place of bundle_adjustment.trim_sigmas where the intrinsics are from camera motion.", gt=0
     )
-    stage_kernel: KernelConfig = setting(
-        KernelConfig(kind="cauchy", threshold=1.0), "Kernel of reprojection where focal lengths are found from camera "
-        "motion; there it takes the place of bundle_adjustment.reprojection_kernel, too.",
-    )  # fmt: skip
+    focal_kernel: KernelConfig = setting(
+        KernelConfig(kind="cauchy", threshold=1.0), "Kernel of reprojection in the refinement that finds focal lengths."
+    )
     min_trim_px: float = setting(0.3, "The least such limit, px.", gt=0)
     trim_rounds: int = setting(12, "How often the limit is lowered and cameras are refined, at most; 0 keeps it.", ge=0)
     epipolar_px: float = setting(

@@ -64,15 +64,13 @@ def settings_of_judgment(config: Config, sequence: Sequence, *, depth_is_needed:
 def settings_of_motion(config: Config) -> Config:
     """Return the configuration of stage 2 for cameras that structure from motion found.
 
-    Their intrinsics are held, fewer tracks may depart from most others than beside a depth cue, and what errs by more
-    than the noise has less of a say.
+    Their intrinsics are held, and fewer tracks may depart from most others than beside a depth cue.
     """
-    settings = config.geometric_depth
-    robust = {"trim_sigmas": settings.stage_trim_sigmas, "reprojection_kernel": settings.stage_kernel}
+    trim = {"trim_sigmas": config.geometric_depth.stage_trim_sigmas}
     return config.model_copy(
         update={
             "input": config.input.model_copy(update={"intrinsics": "fixed"}),
-            "bundle_adjustment": config.bundle_adjustment.model_copy(update=robust),
+            "bundle_adjustment": config.bundle_adjustment.model_copy(update=trim),
         }
     )
 

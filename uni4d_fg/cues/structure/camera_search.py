@@ -67,7 +67,7 @@ class FoundCamera:
     open_focal: tuple[float, ...] = ()
     """Shortest and longest focal length, px, of a zoom that explains all tracks better, but not most of them."""
     told: CameraModel | None = None
-    """The lens that pairs of frames tell, where the found one was refined from that."""
+    """The lens that pairs of frames tell, if one was refined from that."""
     denied_px: float = 0.0
     """How far distortion that explains the tracks better, but that is no lens in all of them, moves a pixel at most."""
 

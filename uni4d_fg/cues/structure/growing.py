@@ -200,7 +200,7 @@ class GrowingScene:
         Observations that err by more than the noise have less of a say, the less the more they do: near where surfaces
         end they err to one side, which a convex kernel lets bend the focal lengths.
         """
-        stage, state, frames, rows = self.bundle(kernel=self.config.geometric_depth.stage_kernel)
+        stage, state, frames, rows = self.bundle(kernel=self.config.geometric_depth.focal_kernel)
         self._take(self._solve(until_converged(stage), state), frames, rows)
 
     def _solve(self, stage: Stage, state: State) -> State:

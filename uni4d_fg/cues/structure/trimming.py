@@ -6,7 +6,7 @@ lowered with the median residual of what agrees, tracks are judged, and bundle a
 agree, until the limit stays: least trimmed squares (P. Rousseeuw, "Least median of squares regression", 1984), for
 which more than half of the observations must be of what stands still. Tracks that were left out are triangulated and
 judged again in every round. The limit is low, so that the cameras come loose from what bends them, and they converge
-with what is within it. Only then it is widened to twice that of all tracks, and those that agree within that come back:
+with the tracks that agree within it. Only then others come back, which agree within twice the limit of all of them:
 what a lens or a rolling shutter displaces a little is not to be missed, but it has no say in a focal length either.
 """
 
