@@ -43,31 +43,31 @@ def test_only_the_first_that_follows_counts() -> None:
     assert things_below(mask, FRACTION) == {1: 2, 2: 3}
 
 
-def areas(**sizes: list[int]) -> dict[int, np.ndarray]:
-    """Areas by id, from names that are an underscore and the id."""
-    return {int(name[1:]): np.array(size) for name, size in sizes.items()}
+def areas(*sizes: list[int]) -> dict[int, np.ndarray]:
+    """Areas of things 1, 2 and so on."""
+    return {label: np.array(size) for label, size in enumerate(sizes, 1)}
 
 
 def test_a_part_stands_by_the_lowest_that_follows_downward() -> None:
     below = [{1: 2, 2: 3}] * 3 + [{}]
-    found = feet_of(below, areas(_1=[9, 9, 9, 9], _2=[9, 9, 9, 0], _3=[9, 9, 9, 9]))
+    found = feet_of(below, areas([9, 9, 9, 9], [9, 9, 9, 0], [9, 9, 9, 9]))
     assert found == ({1: 3, 2: 3, 3: 3},) * 3 + ({1: 1, 3: 3},)
 
 
 def test_who_is_hidden_for_a_while_stands_where_they_do() -> None:
     """Somebody passes before somebody else in two of six frames."""
     below = [{}, {}, {1: 2}, {1: 2}, {}, {}]
-    assert feet_of(below, areas(_1=[9] * 6, _2=[9] * 6)) == ({1: 1, 2: 2},) * 6
+    assert feet_of(below, areas([9] * 6, [9] * 6)) == ({1: 1, 2: 2},) * 6
 
 
 @pytest.mark.parametrize(("last", "foot"), [(17, 2), (19, 1)])
 def test_frames_count_by_what_is_seen(last: int, foot: int) -> None:
-    found = feet_of([{1: 2}, {1: 2}, {}], areas(_1=[9, 9, last], _2=[9, 9, 9]))
+    found = feet_of([{1: 2}, {1: 2}, {}], areas([9, 9, last], [9, 9, 9]))
     assert [here[1] for here in found] == [foot, foot, 1]
 
 
 def test_two_things_below_each_other_end() -> None:
-    assert feet_of([{1: 2, 2: 1}], areas(_1=[9], _2=[9])) == ({1: 2, 2: 1},)
+    assert feet_of([{1: 2, 2: 1}], areas([9], [9])) == ({1: 2, 2: 1},)
 
 
 @given(hnp.arrays(np.int32, (12, 9), elements=st.integers(0, 3)))

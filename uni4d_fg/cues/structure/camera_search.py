@@ -24,13 +24,13 @@ from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens
 from uni4d_fg.cues.structure.lens_of_pairs import lens_of_pairs
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
-from uni4d_fg.cues.structure.sweep import sweeps
 from uni4d_fg.cues.structure.zoom_search import (
     Grown,
     asks_for_zoom,
     explains_most,
     find_zoom,
     focal_range,
+    grown_anew,
     may_be_zoom,
     similar_zoom,
 )
@@ -80,6 +80,7 @@ def find_camera(
     grown: Grown,
     proposed: CameraModel | None = None,
     blur_px: Float32Array | None = None,
+    is_pan: bool = False,
 ) -> FoundCamera | None:
     """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom, beyond doubt.
 
@@ -91,6 +92,7 @@ def find_camera(
         grown: Grows a scene with another camera.
         proposed: A camera from elsewhere: its zoom, if it has one, is tried whatever the scene asks for.
         blur_px: (T,) of the frames, where it is known: sharp ones tell the lens.
+        is_pan: Pairs of frames are then asked for the lens.
 
     Raises:
         Cancelled: If asked to stop.
@@ -104,7 +106,10 @@ def find_camera(
     if proposed is not None and proposed.zoom is None:
         proposed = None
     similar = similar_zoom(scene, image_size) if asks_for_zoom(plain, config) else None
-    told = _told_by_pairs(plain, real, image_size, config) if settings.model == "auto" else None
+    told = None
+    if is_pan and settings.model == "auto":  # Its cameras are bent too far to ask for a lens.
+        num_frames = len(scene.registered)
+        told = lens_of_pairs(real, num_frames, image_size, plain.camera.intrinsics, config.geometric_depth)
     asks_for_lens = settings.model == "auto" and (
         told is not None or fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )
@@ -163,16 +168,6 @@ def is_lens(camera: CameraModel, image_size: tuple[int, int], gain: float, confi
     return gain >= config.camera.min_evidence_unsure if strength is Strength.WEAK else gain > 0.0
 
 
-def _told_by_pairs(
-    plain: Fitted, real: Observations, image_size: tuple[int, int], config: Config
-) -> CameraModel | None:
-    """Return the lens that pairs of frames tell of a pan, whose cameras are bent too far to ask for it, or None."""
-    num_frames = len(plain.scene.registered)
-    if not sweeps(real, num_frames, image_size):
-        return None
-    return lens_of_pairs(real, num_frames, image_size, plain.camera.intrinsics, config.geometric_depth)
-
-
 def _refined(plain: Fitted, judge: TrackJudge, config: Config) -> Fitted:
     """Fit a radial lens to the cameras of a pinhole, and from there once more with near and far exchanged."""
     found = _with_lens(plain, plain, judge, config)
@@ -191,13 +186,9 @@ def _grown_with(
     told: CameraModel, plain: Fitted, judge: TrackJudge, real: Observations, config: Config, grown: Grown
 ) -> Fitted | None:
     """Return the lens that a scene leads to which is grown with one that was told; None where nothing grows."""
-    scene = grown(told.ideal_observations(real), told.intrinsics)
-    if scene is None:
-        return None
-    part = part_of(scene, config.camera.observations, plain.scene.registered)
-    part.free_focal = plain.scene.free_focal
+    start = grown_anew(told, plain, real, config, grown)
     try:
-        return _with_lens(judge.anew(Fitted(told, part)), plain, judge, config)
+        return None if start is None else _with_lens(judge.anew(start), plain, judge, config)
     except SolverError:
         return None
 

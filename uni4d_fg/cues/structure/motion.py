@@ -155,7 +155,7 @@ def structure_from_motion(
         try:
             found = find_camera(
                 grown.scene, observations, image_size, config,
-                quiet.trial, proposed, blur_px,
+                quiet.trial, proposed, blur_px, is_pan,
             )  # fmt: skip
         except SolverError:  # That of another camera is no reason to do without this one.
             found = None

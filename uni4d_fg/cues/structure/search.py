@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -72,6 +73,11 @@ class Grown:
     """The best first."""
     used: Observations
     """Those that starts were grown from."""
+
+    @cached_property
+    def sharpness(self) -> float:
+        """See :func:`_sharpness`."""
+        return _sharpness(self.scene, self.used)
 
 
 @dataclass(frozen=True)
@@ -195,7 +201,7 @@ class Search:
             grown = self.grow(ideal, camera.intrinsics, free_focal)
             if grown is not None:
                 trials.append((grown, replace(found, camera=camera), ideal))
-        return min(trials, key=lambda trial: _sharpness(trial[0].scene, trial[0].used), default=None)
+        return min(trials, key=lambda trial: trial[0].sharpness, default=None)
 
     def needs_zoom(self, real: Observations, intrinsics: FloatArray, blur_px: Float32Array | None) -> bool:
         """Tell whether tracks (as the images show them) ask for a zoom of a scene that is grown without one."""
@@ -241,7 +247,7 @@ class Search:
         """
         if is_open and found.lens_gain < _CLEAR_GAIN:
             return False
-        if _sharpness(grown.scene, grown.used) > _BLUNTER * _sharpness(plain.scene, plain.used):
+        if grown.sharpness > _BLUNTER * plain.sharpness:
             return False
         if not self.is_weak(found.camera):
             return True

@@ -111,20 +111,16 @@ def find_zoom(
         Cancelled: If asked to stop.
     """
 
-    def grown_anew(camera: CameraModel) -> list[Fitted]:
-        other = grown(camera.ideal_observations(real), camera.intrinsics)
-        if other is None:
-            return []
-        part = part_of(other, config.camera.observations, plain.scene.registered)
-        part.free_focal = scene.free_focal
-        return _fitted([Fitted(camera, part)], judge, config)
+    def anew(camera: CameraModel) -> list[Fitted]:
+        other = grown_anew(camera, plain, real, config, grown)
+        return [] if other is None else _fitted([other], judge, config)
 
     found = _fitted([plain, *_mapped(plain, judge)], judge, config)
     at_hand = len(found)
     if proposed is not None:
-        found += grown_anew(proposed)
+        found += anew(proposed)
     if similar is not None and (config.camera.zoom == "on" or not _finds_none(found, judge, scene, config)):
-        found += grown_anew(similar)
+        found += anew(similar)
     if not found:
         return None
     to_the_end = {"relative_decrease": config.camera.relative_decrease, "max_iterations": _STEPS}
@@ -147,6 +143,16 @@ def find_zoom(
         if float(np.ptp(_log_zoom(best) - _log_zoom(before))) < _SETTLED:
             break
     return best
+
+
+def grown_anew(camera: CameraModel, plain: Fitted, real: Observations, config: Config, grown: Grown) -> Fitted | None:
+    """Return another camera with part of what grows with it, to be fitted as the plain one is; None if nothing does."""
+    scene = grown(camera.ideal_observations(real), camera.intrinsics)
+    if scene is None:
+        return None
+    part = part_of(scene, config.camera.observations, plain.scene.registered)
+    part.free_focal = plain.scene.free_focal
+    return Fitted(camera, part)
 
 
 def _fitted(trials: list[Fitted], judge: TrackJudge, config: Config) -> list[Fitted]:
