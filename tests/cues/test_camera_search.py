@@ -15,7 +15,7 @@ from uni4d_fg.config.load import load_config
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.start_doubts import start_doubts
-from uni4d_fg.cues.structure import camera_search, motion, search, zoom_search
+from uni4d_fg.cues.structure import camera_search, search, zoom_search
 from uni4d_fg.cues.structure.camera_fit import Fitted
 from uni4d_fg.cues.structure.camera_search import FoundCamera, is_lens
 from uni4d_fg.cues.structure.growing import GrowingScene
@@ -77,7 +77,7 @@ def test_a_search_that_fails_leaves_the_pinhole(monkeypatch: pytest.MonkeyPatch)
     def fail(*_: object) -> None:
         raise SolverError("no")
 
-    monkeypatch.setattr(motion, "find_camera", fail)
+    monkeypatch.setattr(search, "find_camera", fail)
     assert structure(tracked(sideways(FRAMES))).camera.is_plain
 
 
@@ -148,7 +148,7 @@ def test_a_lens_is_not_believed_where_the_focal_length_is_open_unless_it_explain
     path: Callable[[int], np.ndarray], gain: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lens = CameraModel(K, Lens("SIMPLE_RADIAL", (-0.12,)))
-    monkeypatch.setattr(motion, "find_camera", lambda *_: FoundCamera(lens, gain))
+    monkeypatch.setattr(search, "find_camera", lambda *_: FoundCamera(lens, gain))
     scene = through(tracked(path(FRAMES), points=1500), lens)
     found = structure(scene)
     assert found.focal.is_wide is (path is forward)
@@ -183,7 +183,7 @@ def test_a_weak_lens_is_not_believed_where_starts_end_at_other_focal_lengths(
     apart: float, k1: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lens = CameraModel(K, Lens("SIMPLE_RADIAL", (k1,)))
-    monkeypatch.setattr(motion, "find_camera", lambda *_: FoundCamera(lens, 0.02))
+    monkeypatch.setattr(search, "find_camera", lambda *_: FoundCamera(lens, 0.02))
     monkeypatch.setattr(search, "rivals_of", lambda *_: [Rival(2, 9, apart * K[0], 0.1, 0.2, 0.01)])
     scene = through(tracked(sideways(FRAMES)), lens)
     found = structure(scene)

@@ -14,7 +14,11 @@ class MultiviewConfig(Section):
     )
     least_side_px: int = setting(320, "... and of at least this, where they are that large.", ge=32)
     views: int = setting(4, "Frames that a frame is matched with, at most.", ge=1, le=16)
-    reach: int = setting(16, "They are at most this many frames away.", ge=1)
+    reach: int = setting(
+        16,
+        "They are at most this many frames away, four times as many where too few of these have parallax.",
+        ge=1,
+    )
     min_overlap: float = setting(0.5, "A view sees at least this part of the frame's landmarks.", ge=0, le=1)
     min_angle_deg: float = setting(
         0.4, "Views whose rays to the frame's landmarks meet at less than this (median) are left out, degrees.", gt=0

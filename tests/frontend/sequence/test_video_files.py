@@ -166,6 +166,15 @@ def test_beginning_of_a_video_that_is_cut_short(tmp_path: Path) -> None:
     assert len(list(frames)) == stop
 
 
+@pytest.mark.parametrize("data", [b"\xea\x75\xb6\xc9\x91\x40\x4d\x61" + bytes(256), b"\0\0\0"])
+def test_bytes_behind_the_last_box(tmp_path: Path, data: bytes) -> None:
+    """Not of the video, and no sign that something is missing."""
+    path = write_video(tmp_path / "clip.mp4", moving_frames(9))
+    path.write_bytes(path.read_bytes() + data)
+    assert missing_bytes(path) == 0
+    assert len(VideoFrames(path)) == 9
+
+
 @settings(max_examples=60, deadline=None)
 @given(data=st.binary(max_size=80), start=st.sampled_from([b"", b"\0\0\0\x18ftyp", b"RIFF", b"\x1a\x45\xdf\xa3\x81"]))
 def test_any_bytes_have_an_end(tmp_path_factory: pytest.TempPathFactory, data: bytes, start: bytes) -> None:

@@ -22,7 +22,6 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, part_of, probing
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens
-from uni4d_fg.cues.structure.lens_of_pairs import lens_of_pairs
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
 from uni4d_fg.cues.structure.zoom_search import (
     Grown,
@@ -80,7 +79,7 @@ def find_camera(
     grown: Grown,
     proposed: CameraModel | None = None,
     blur_px: Float32Array | None = None,
-    is_pan: bool = False,
+    told: CameraModel | None = None,
 ) -> FoundCamera | None:
     """Return the camera that the tracks ask for, or None where that is a pinhole that does not zoom, beyond doubt.
 
@@ -92,7 +91,7 @@ def find_camera(
         grown: Grows a scene with another camera.
         proposed: A camera from elsewhere: its zoom, if it has one, is tried whatever the scene asks for.
         blur_px: (T,) of the frames, where it is known: sharp ones tell the lens.
-        is_pan: Pairs of frames are then asked for the lens.
+        told: The lens that pairs of frames tell: a scene is grown with it, too.
 
     Raises:
         Cancelled: If asked to stop.
@@ -106,10 +105,6 @@ def find_camera(
     if proposed is not None and proposed.zoom is None:
         proposed = None
     similar = similar_zoom(scene, image_size) if asks_for_zoom(plain, config) else None
-    told = None
-    if is_pan and settings.model == "auto":  # Its cameras are bent too far to ask for a lens.
-        num_frames = len(scene.registered)
-        told = lens_of_pairs(real, num_frames, image_size, plain.camera.intrinsics, config.geometric_depth)
     asks_for_lens = settings.model == "auto" and (
         told is not None or fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
     )

@@ -25,7 +25,7 @@ from uni4d_fg.slam.stages.observations import Observations
 _K1 = np.linspace(-0.4, 0.15, 12)
 """That are tried, at a focal length of the longer side of the image."""
 _CLEAR = 0.95
-"""Part of what a pinhole leaves that the best lens leaves at most."""
+"""Part of what a pinhole leaves that the best lens leaves at most: between others that leave more."""
 
 
 def lens_of_pairs(
@@ -52,7 +52,7 @@ def lens_of_pairs(
     ]
     left = np.array([geometry.left_px for geometry in found])
     best = int(left.argmin())
-    if not left[best] <= _CLEAR * left[np.abs(_K1).argmin()]:
+    if best in (0, len(_K1) - 1) or not left[best] <= _CLEAR * left[np.abs(_K1).argmin()]:
         return None
     told = focal_of_pairs(found[best].fundamental, image_size, intrinsics[2:])
     focal = told.focal if told is not None and told.is_agreed else float(np.mean(intrinsics[:2]))

@@ -13,7 +13,6 @@ from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import without_rolling_shutter
 from uni4d_fg.cues.structure.all_tracks import points_of_all_tracks
 from uni4d_fg.cues.structure.camera_fit import zoom_freedom
-from uni4d_fg.cues.structure.camera_search import find_camera
 from uni4d_fg.cues.structure.first_pair import CommonTracks, FramePair, rank_pairs
 from uni4d_fg.cues.structure.focal_interval import FocalInterval, focal_interval, focal_is_open
 from uni4d_fg.cues.structure.growing import GrowingScene
@@ -23,7 +22,7 @@ from uni4d_fg.cues.structure.search import Search, StartCameras
 from uni4d_fg.cues.structure.sweep import sweeps
 from uni4d_fg.cues.structure.triangulation import Points
 from uni4d_fg.cues.structure.two_view import fit_rotation
-from uni4d_fg.errors import Cancelled, SolverError
+from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
@@ -150,23 +149,21 @@ def structure_from_motion(
     if any_camera and free_focal and camera.is_plain:
         reporter.begin("lens and zoom", None)
         quiet = replace(search, reporter=SilentReporter())
-        if not config.camera.reads_at_once:
-            grown, observations, readout = quiet.at_one_time(grown, observations, camera.intrinsics)
-        try:
-            found = find_camera(
-                grown.scene, observations, image_size, config,
-                quiet.trial, proposed, blur_px, is_pan,
-            )  # fmt: skip
-        except SolverError:  # That of another camera is no reason to do without this one.
-            found = None
+        # What a pan through a lens is bent to with a pinhole asks for a lens less than for a readout.
+        told, found = quiet.told_by_pairs(observations), None
+        if told is not None:
+            found = quiet.find_camera(grown, observations, proposed, blur_px, told)
+        if found is None or found.told is None:
+            if not config.camera.reads_at_once:
+                grown, observations, readout = quiet.at_one_time(grown, observations, camera.intrinsics)
+            if told is None or readout is not None:
+                found = quiet.find_camera(grown, observations, proposed, blur_px)
         reporter.end()
         if found is not None:
             beside += found.open_focal
             denied_px = found.denied_px
-        again = None
-        # What a pan through a lens is bent to with a pinhole asks for a readout as well.
-        is_misled = readout is not None and found is not None and found.told is not None
-        if found is not None and not found.camera.is_plain and not is_misled:
+        again, is_misled = None, False
+        if found is not None and not found.camera.is_plain:
             again = search.grow_with(observations, found, free_focal)
         if again is not None:
             other, found, ideal = again

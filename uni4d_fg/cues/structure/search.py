@@ -13,13 +13,14 @@ from uni4d_fg.arrays import Float32Array, FloatArray
 from uni4d_fg.config.models import Config
 from uni4d_fg.cues.depth_settings import with_smaller_angles
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
-from uni4d_fg.cues.structure.camera_search import FoundCamera, lens_strength, needs_zoom
+from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength, needs_zoom
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
 from uni4d_fg.cues.structure.focal_interval import FocalInterval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, ranked
 from uni4d_fg.cues.structure.judging import errors_of
+from uni4d_fg.cues.structure.lens_of_pairs import lens_of_pairs
 from uni4d_fg.cues.structure.passing_thing import explains_more, most_left_over, only_seems_to_turn
 from uni4d_fg.cues.structure.readout import at_one_time, find_readout
 from uni4d_fg.cues.structure.reversal import nearer_to_the_tracks
@@ -186,6 +187,28 @@ class Search:
         grow(scene, self.reporter)
         trim_and_converge(scene)
         return nearer_to_the_tracks(scene)
+
+    def told_by_pairs(self, observations: Observations) -> CameraModel | None:
+        """Return the lens that pairs of frames tell of a pan; None where they tell none, or none is looked for."""
+        if not self.is_pan or self.config.camera.model != "auto":
+            return None
+        settings = self.config.geometric_depth
+        return lens_of_pairs(observations, self.num_frames, self.image_size, self.prior_intrinsics, settings)
+
+    def find_camera(
+        self, grown: Grown, observations: Observations, proposed: CameraModel | None, blur_px: Float32Array | None,
+        told: CameraModel | None = None,
+    ) -> FoundCamera | None:  # fmt: skip
+        """Return the camera that tracks ask for whose pinhole led to ``grown``; None for that, or without a solution.
+
+        The other arguments are those of :func:`~uni4d_fg.cues.structure.camera_search.find_camera`.
+        """
+        try:
+            return find_camera(
+                grown.scene, observations, self.image_size, self.config, self.trial, proposed, blur_px, told
+            )
+        except SolverError:  # That of another camera is no reason to do without this one.
+            return None
 
     def grow_with(
         self, observations: Observations, found: FoundCamera, free_focal: bool

@@ -63,7 +63,9 @@ def _end_of_boxes(stream: IO[bytes], size: int) -> int:
         length = int.from_bytes(header[:4], "big")
         if length == 1:
             length = int.from_bytes(header[8:16], "big")
-        if length < 8:  # 0: up to the end of the file, whatever that is; else damaged
+        # A length of 0 goes up to the end of the file, whatever that is; less is damage. What has no name of four
+        # letters is no box: some programs leave bytes of their own behind the last one, which players pass over.
+        if length < 8 or not all(0x20 <= letter <= 0x7E or letter == 0xA9 for letter in header[4:8]):
             return size
         position += length
     return position

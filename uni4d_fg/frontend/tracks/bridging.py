@@ -203,9 +203,10 @@ class Bridges:
         todo = np.ones(len(lost), np.bool_)
         for age, frame in enumerate(self._remembered):
             row, followed = frame.rows(lost)
-            # Where something goes that moves by itself is not known.
-            there = followed & todo & (frame.known.still[row] >= _LEAST_STILL)
+            there = np.flatnonzero(followed & todo)
             todo &= ~followed
+            # Where something goes that moves by itself is not known.
+            there = there[frame.known.still[row[there]] >= _LEAST_STILL]
             row = row[there]
             first = self._step - _INTERVAL * (len(self._remembered) - age)
             new = _Hidden.of(lost[there], self._step - _INTERVAL, first, frame.points[row], frame.known.picked(row))

@@ -16,7 +16,7 @@ from uni4d_fg.results.fusion.multiview.edges import edges_again
 from uni4d_fg.results.fusion.multiview.exposure import Shown, exposures
 from uni4d_fg.results.fusion.multiview.planes import choose_planes
 from uni4d_fg.results.fusion.multiview.sweep import sweep
-from uni4d_fg.results.fusion.multiview.views import choose_views
+from uni4d_fg.results.fusion.multiview.views import choose_views, farthest_view
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize
 from uni4d_fg.results.fusion.pixel_transfer import PixelTransfer, pixel_transfer
 
@@ -129,7 +129,7 @@ class MultiviewDepth:
         """
         oldest = frame - max(self.config.compared_offsets, default=0)
         self.raw = {number: kept for number, kept in self.raw.items() if number >= oldest}
-        oldest = min(oldest - self.config.reach, finished - max(self.config.edge_offsets, default=0))
+        oldest = min(oldest - farthest_view(self.config), finished - max(self.config.edge_offsets, default=0))
         self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest}
 
     def _raw(self, frame: int) -> _Raw | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from uni4d_fg.arrays import FloatArray, evenly_spread
@@ -10,6 +12,8 @@ from uni4d_fg.geometry.camera import project
 
 _MAX_POINTS = 1000
 """More landmarks do not tell better where a frame is seen from."""
+_FARTHER, _FARTHER_STEP = 4, 4
+"""A slow camera is followed so many times as far, in steps of so many frames."""
 
 
 def choose_views(
@@ -24,6 +28,8 @@ def choose_views(
 
     A view is worth the share of the points that it sees, times how near the median angle between the rays to them is
     to the wanted one. Views are taken from before and after in turn, so that what one side does not see the other may.
+    Frames that are near in time look most alike: only where a camera is so slow that they have too few views among
+    them, those farther away are asked, too.
 
     Args:
         frame: The frame.
@@ -39,9 +45,9 @@ def choose_views(
     height, width = image_size
     here = points - world_T_cam[frame, :3, 3]
     worth: dict[int, float] = {}
-    for other in range(max(0, frame - config.reach), min(len(world_T_cam), frame + config.reach + 1)):
-        if other == frame:
-            continue
+    for other in _candidates(frame, len(world_T_cam), config.reach):
+        if abs(other - frame) > config.reach and len(worth) >= config.views:
+            break
         there = points - world_T_cam[other, :3, 3]
         seen_from = there @ world_T_cam[other, :3, :3]
         front = seen_from[:, 2] > 1e-6
@@ -60,6 +66,18 @@ def choose_views(
     sides = [sorted((o for o in worth if (o > frame) == after), key=lambda o: -worth[o]) for after in (False, True)]
     chosen = _spread(sides, config.views)
     return sorted(chosen, key=lambda other: -worth[other])
+
+
+def farthest_view(config: MultiviewConfig) -> int:
+    """Return how many frames away a view may be."""
+    return _FARTHER * config.reach
+
+
+def _candidates(frame: int, num_frames: int, reach: int) -> Iterator[int]:
+    """Yield the frames that may be views: all within reach, and some of those beyond, the nearest first."""
+    distances = (*range(1, reach + 1), *range(reach + _FARTHER_STEP, _FARTHER * reach + 1, _FARTHER_STEP))
+    for distance in distances:
+        yield from (other for other in (frame - distance, frame + distance) if 0 <= other < num_frames)
 
 
 def _spread(sides: list[list[int]], count: int) -> list[int]:
