@@ -37,9 +37,9 @@ def test_factor_is_found_beside_what_moves(factor: float, seed: int) -> None:
     assert found == pytest.approx([1 / factor, 1.0], rel=5e-3)
 
 
-@pytest.mark.parametrize("case", ["few", "behind", "dark", "masked"])
+@pytest.mark.parametrize("case", ["none", "few", "behind", "dark", "masked"])
 def test_too_few_points_change_nothing(case: str, rng: np.random.Generator) -> None:
-    seen, other = points(rng, 10 if case == "few" else 200), 1.2 * wall(ALONG_X)
+    seen, other = points(rng, {"none": 0, "few": 10}.get(case, 200)), 1.2 * wall(ALONG_X)
     if case == "behind":
         seen[:, 2] = -2.0
     if case == "dark":

@@ -37,6 +37,8 @@ def exposures(own: Shown, others: list[Shown], points: FloatArray) -> list[float
     Returns:
         V factors; 1 where too few points tell.
     """
+    if len(points) < _MIN_POINTS:
+        return [1.0] * len(others)
     points = points[evenly_spread(len(points), _MAX_POINTS)]
     here = _gray_at(own, points)
     factors = []
