@@ -174,3 +174,17 @@ def test_recall_and_precision_in_a_room_with_parallax() -> None:
     assert possible > 60
     assert joined > 0.75 * possible
     assert joined - right <= 1
+
+
+def test_where_all_is_lost_at_once_points_go_on_as_without_bridging() -> None:
+    """Black, a scene, and another one: a frame that shows nothing is remembered beside those whose points are lost."""
+    scenes = [np.rint(texture(seed, HEIGHT, WIDTH)) for seed in (0, 7)]
+    images = np.zeros((36, HEIGHT, WIDTH), np.uint8)
+    images[6:16], images[16:] = scenes
+    plain, bridged = (track(images, frames, query_interval=4) for frames in (0, 25))
+    for tracks in (plain, bridged):
+        first, second = tracks.visible[:, 6:16].any(axis=1), tracks.visible[:, 16:].any(axis=1)
+        assert (first & ~second).sum() > 100
+        assert (second & ~first).sum() > 100
+        assert not tracks.visible[:, :5].any()
+    np.testing.assert_array_equal(bridged.visible.sum(axis=0), plain.visible.sum(axis=0))
