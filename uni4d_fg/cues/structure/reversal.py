@@ -28,8 +28,8 @@ from uni4d_fg.errors import SolverError
 _NEARLY = 20.0
 """The reversed scene is refined if it misses the tracks by no more than so many times what the scene itself does."""
 _HOPELESS = 1.35
-"""Times the robust energy of a scene from which on the reversed one is given up before it is trimmed: on twenty clips
-trimming took away a fifth at most, and of the reversed scenes that were taken the highest had 1.07."""
+"""Times the robust energy of a scene from which on the reversed one is given up before it is trimmed: in eleven
+scenes trimming took away a fifth at most, and the only one that was taken in the end had 1.07."""
 _FARTHEST = 20.0
 """Of the usual distance: what a reversal takes beyond infinity is put there."""
 _LEAST_POINTS = 6
