@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -162,6 +163,26 @@ def test_a_lens_is_not_believed_where_the_focal_length_is_open_unless_it_explain
         assert bent is not None
         for focal in (plain.intrinsics[:2].mean(), bent.intrinsics[:2].mean()):
             assert 0.97 * found.focal.low <= focal <= 1.03 * found.focal.high
+
+
+@pytest.mark.parametrize(
+    ("focal", "sharpness", "is_open", "is_told"),
+    [(140.0, 0.2, True, False), (500.0, 0.2, True, False), (140.0, 0.15, True, True), (140.0, 0.2, False, True),
+     (200.0, 0.208, True, True), (200.0, 0.24, True, False)],
+)  # fmt: skip
+def test_a_lens_that_halves_an_open_focal_length_must_make_the_sharpest_errors_smaller(
+    focal: float, sharpness: float, is_open: bool, is_told: bool
+) -> None:
+    lens = FoundCamera(CameraModel(K, Lens("SIMPLE_RADIAL", (-0.12,))), 0.04)
+    plain, grown = (
+        SimpleNamespace(sharpness=sharp, scene=SimpleNamespace(mean_focal=length))
+        for length, sharp in ((260.0, 0.2), (focal, sharpness))
+    )
+    asked = search.Search(
+        FRAMES, SIZE, K, load_config("default", []), SilentReporter(), lambda: False, is_pan=False
+    )  # fmt: skip
+    assert not asked.is_weak(lens.camera)
+    assert asked.tells_lens(plain, grown, lens, is_open) is is_told  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -38,9 +38,10 @@ from uni4d_fg.slam.stages.observations import Observations
 _CLEAR_GAIN = 0.02
 """Part of the reprojection energy that a lens must take away where the focal length is open: straight forward
 k1 of -0.1 takes 0.8 to 2 %, -0.25 takes 13 %, and it is up to 1.1 % without a lens."""
-_SHARPER = 0.97
-"""Times the sharpest errors of a scene with a pinhole that one with a lens has there, at most: 0.53 to 0.92 for lenses
-that were right, and 1.003 on a recording whose focal length a lens halves."""
+_FAR_FOCAL, _SHARPER = 1.5, 0.97
+"""A lens that changes an open focal length by more than this factor must leave sharpest errors of at most this part of
+the pinhole's: for lenses that were right they were 0.53 to 1.04, the focal length up to 1.39 times as long without; on
+a recording whose focal length a lens halves, they were 1.003."""
 _HARDLY_TRIMMED = 0.8
 """Part of ``max_reprojection_px`` at which a limit that follows the noise is about where it began."""
 _MOST_AGREE = 0.8
@@ -268,13 +269,14 @@ class Search:
         """Tell whether tracks that leave a lens, and scenes grown without and with it, leave no doubt of the lens.
 
         Where they leave the focal length open (``is_open``), as straight forward, they leave distortion open as well,
-        unless it explains much, and the sharpest errors are smaller for it. A weak lens is also doubted where starts
-        end at focal lengths so far from each other that a run says so: an error that bends the scene of one of them
-        bends the lens, too.
+        unless it explains much; and where it also makes quite another focal length, unless the sharpest errors are
+        smaller for it. A weak lens is also doubted where starts end at focal lengths so far from each other that a run
+        says so: an error that bends the scene of one of them bends the lens, too.
         """
         if is_open and found.lens_gain < _CLEAR_GAIN:
             return False
-        if grown.sharpness > (_SHARPER if is_open else _BLUNTER) * plain.sharpness:
+        is_far = abs(np.log(grown.scene.mean_focal / plain.scene.mean_focal)) > np.log(_FAR_FOCAL)
+        if grown.sharpness > (_SHARPER if is_open and is_far else _BLUNTER) * plain.sharpness:
             return False
         if not self.is_weak(found.camera):
             return True
