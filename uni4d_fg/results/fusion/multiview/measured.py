@@ -16,7 +16,7 @@ from uni4d_fg.results.fusion.multiview.edges import edges_again
 from uni4d_fg.results.fusion.multiview.exposure import Shown, exposures
 from uni4d_fg.results.fusion.multiview.planes import choose_planes
 from uni4d_fg.results.fusion.multiview.sweep import sweep
-from uni4d_fg.results.fusion.multiview.views import choose_views, farthest_view
+from uni4d_fg.results.fusion.multiview.views import choose_views
 from uni4d_fg.results.fusion.multiview.working_frame import WorkingFrame, WorkingSize
 from uni4d_fg.results.fusion.pixel_transfer import PixelTransfer, pixel_transfer
 
@@ -58,6 +58,8 @@ class MultiviewDepth:
     threads: int = 0
     raw: dict[int, _Raw | None] = field(default_factory=dict)
     shown: dict[int, WorkingFrame] = field(default_factory=dict)
+    farthest: int = 0
+    """How many frames away a view was, at most."""
 
     def at(self, frame: int) -> Measured | None:
         """Return the depth of a frame; None where the camera shows no parallax."""
@@ -129,7 +131,7 @@ class MultiviewDepth:
         """
         oldest = frame - max(self.config.compared_offsets, default=0)
         self.raw = {number: kept for number, kept in self.raw.items() if number >= oldest}
-        oldest = min(oldest - farthest_view(self.config), finished - max(self.config.edge_offsets, default=0))
+        oldest = min(oldest - self.farthest, finished - max(self.config.edge_offsets, default=0))
         self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest}
 
     def _raw(self, frame: int) -> _Raw | None:
@@ -150,6 +152,7 @@ class MultiviewDepth:
         views = choose_views(frame, self.world_T_cam, points, cameras, sides, self.config)
         if not views:
             return None
+        self.farthest = max(self.farthest, *(abs(view - frame) for view in views))
         transfers = self._transfers(frame, views)
         planes = choose_planes(z, transfers, sides, self.config)
         own = self._shown(frame)

@@ -68,11 +68,6 @@ def choose_views(
     return sorted(chosen, key=lambda other: -worth[other])
 
 
-def farthest_view(config: MultiviewConfig) -> int:
-    """Return how many frames away a view may be."""
-    return _FARTHER * config.reach
-
-
 def _candidates(frame: int, num_frames: int, reach: int) -> Iterator[int]:
     """Yield the frames that may be views: all within reach, and some of those beyond, the nearest first."""
     distances = (*range(1, reach + 1), *range(reach + _FARTHER_STEP, _FARTHER * reach + 1, _FARTHER_STEP))
