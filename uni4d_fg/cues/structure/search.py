@@ -207,12 +207,11 @@ class Search:
 
         The other arguments are those of :func:`~uni4d_fg.cues.structure.camera_search.find_camera`.
         """
-        try:
-            return find_camera(
+        return _if_solved(
+            lambda: find_camera(
                 grown.scene, observations, self.image_size, self.config, self.trial, proposed, blur_px, told
             )
-        except SolverError:  # That of another camera is no reason to do without this one.
-            return None
+        )
 
     def grow_with(
         self, observations: Observations, found: FoundCamera, free_focal: bool
@@ -294,7 +293,7 @@ def _at_cameras(scene: GrowingScene, start: StartCameras) -> GrowingScene:
 
 
 def _if_solved(grow_other: Callable[[], SceneT | None]) -> SceneT | None:
-    """Return another scene, or None where it cannot be solved: that is no reason to do without the other starts."""
+    """Return another scene or camera, or None where it cannot be solved: that is no reason to do without the others."""
     try:
         return grow_other()
     except SolverError:
