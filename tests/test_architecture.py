@@ -8,7 +8,7 @@ by side may name each other in such places, but do not load each other in a circ
 from __future__ import annotations
 
 import ast
-from collections import defaultdict
+from collections import Counter, defaultdict
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -121,6 +121,25 @@ def test_no_file_is_long() -> None:
     sources = (path for folder in folders for kind in ("*.py", "*.hpp", "*.cpp") for path in folder.rglob(kind))
     lengths = {str(path): len(path.read_text(encoding="utf-8").splitlines()) for path in sources}
     assert {path: length for path, length in lengths.items() if length > MAX_LINES} == {}
+
+
+def bound(statement: ast.stmt) -> list[str]:
+    """The names that a statement of a module assigns, or defines."""
+    if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return [statement.name]
+    targets = statement.targets if isinstance(statement, ast.Assign) else []
+    targets = [statement.target] if isinstance(statement, ast.AnnAssign) else targets
+    return [node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
+
+
+def test_no_name_of_a_module_is_bound_twice() -> None:
+    """A second constant of the same name would silently replace the first one where both are read."""
+    twice = []
+    for module, path in FILES.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        count = Counter(name for statement in tree.body for name in bound(statement))
+        twice += [f"{module}.{name}" for name, times in count.items() if times > 1]
+    assert twice == []
 
 
 def test_names_of_test_modules_are_unique() -> None:

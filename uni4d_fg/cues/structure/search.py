@@ -38,7 +38,7 @@ from uni4d_fg.slam.stages.observations import Observations
 _CLEAR_GAIN = 0.02
 """Part of the reprojection energy that a lens must take away where the focal length is open: straight forward
 k1 of -0.1 takes 0.8 to 2 %, -0.25 takes 13 %, and it is up to 1.1 % without a lens."""
-_FAR_FOCAL, _SHARPER = 1.5, 0.97
+_FAR_FOCAL, _SHARPER_FOR_IT = 1.5, 0.97
 """A lens that changes an open focal length by more than this factor must leave sharpest errors of at most this part of
 the pinhole's: for lenses that were right they were 0.53 to 1.04, the focal length up to 1.39 times as long without; on
 a recording whose focal length a lens halves, they were 1.003."""
@@ -275,7 +275,7 @@ class Search:
         if is_open and found.lens_gain < _CLEAR_GAIN:
             return False
         is_far = abs(np.log(grown.scene.mean_focal / plain.scene.mean_focal)) > np.log(_FAR_FOCAL)
-        if grown.sharpness > (_SHARPER if is_open and is_far else _BLUNTER) * plain.sharpness:
+        if grown.sharpness > (_SHARPER_FOR_IT if is_open and is_far else _BLUNTER) * plain.sharpness:
             return False
         if not self.is_weak(found.camera):
             return True
