@@ -35,7 +35,7 @@ from uni4d_fg.results.fusion.static_depth import (
     probability_right,
     without_edges,
 )
-from uni4d_fg.results.fusion.told_error import final_confidence, without_texture
+from uni4d_fg.results.fusion.told_error import as_often_right, final_confidence, without_texture
 from uni4d_fg.results.fusion.upsampling import upsample_guided
 from uni4d_fg.slam.stages.scene import StaticNoise
 
@@ -251,7 +251,8 @@ class DenseMaps:
             full = lifted(filled, self.size.continued(mine.log_cue), given, self.size)
         if (moving > 0).any():
             full[moving > 0] = np.exp(self._moving(frame, given, moving)[moving > 0])
-        return full, FinalStatic(log_depth, sure, self.size.shown(unmasked))
+        told = as_often_right(sure) if self.is_interpolated else sure
+        return full, FinalStatic(log_depth, told, self.size.shown(unmasked))
 
     def common_sigma(self, frame: int) -> float:
         """Return the standard deviation of log depth that a frame shares with those it is compared with."""

@@ -26,6 +26,9 @@ _MANY_FRAMES = 4
 _PLAIN, _PLAINER = np.float32(0.008), 2
 """Gray values that vary by less than this (of 1, at the usual working size) are plain, and the power: fitted to a room,
 a street, and a table before a plain wall."""
+_TOO_SURE, _LESS_SURE = np.float32(2.6), np.float32(0.62)
+"""Odds beyond which depth from motion alone is right less often than they say, and the power of what is beyond: fitted
+to fifteen clips of two renderers."""
 _EDGE_WINDOW = np.ones((5, 5), np.uint8)
 _STEEPEST = np.float32(0.3)
 _UNBENT, _BENT_WEIGHT = np.float32(1.0), np.float32(-2.2)
@@ -37,7 +40,7 @@ _BINS = np.array([0.3, 0.6, 0.8, 0.9, 0.95, 0.98])
 _SURENESS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0], np.float32)
 _ERRORS = np.array([0.16, 0.05, 0.029, 0.0155, 0.0095, 0.0045, 0.0025], np.float32)
 """Mean errors at these probabilities, linear in between: of clips of two renderers, with cues as networks make them."""
-_FROM_MOTION = np.array([0.125, 0.066, 0.049, 0.04, 0.025, 0.018, 0.007], np.float32)
+_FROM_MOTION = np.array([0.125, 0.066, 0.049, 0.04, 0.0232, 0.0102, 0.007], np.float32)
 """The same where the cue was interpolated between static points: medians of nine clips of a third renderer, and of two
 recordings."""
 _PRIOR_SHARE = 0.8
@@ -91,6 +94,16 @@ def without_texture(sure: Float32Array, gray: Float32Array, radius: int) -> Floa
     varies = cv2.erode(varies, np.ones(window, np.uint8))
     odds = np.minimum(varies / np.float32(finer * _PLAIN), np.float32(1)) ** _PLAINER
     return np.asarray(sure * odds / (1 - sure + sure * odds + np.float32(1e-9)), np.float32)
+
+
+def as_often_right(sure: Float32Array) -> Float32Array:
+    """Return probabilities of depth from motion alone, of the same shape, that are right as often as they say.
+
+    Frames without a cue share more errors than those that a cue judges: rims of what is near, what reflects, the
+    focal length.
+    """
+    against = _TOO_SURE * (1 - sure) / np.maximum(sure, np.float32(1e-6))
+    return np.asarray(np.where(against < 1, 1 / (1 + against**_LESS_SURE / _TOO_SURE), sure), np.float32)
 
 
 def _bend(log_depth: Float32Array) -> Float32Array:
