@@ -11,7 +11,7 @@ from cues.start_scenes import SIZE, K, TrackedScene, observed, sideways
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import Structure, structure_from_motion
-from uni4d_fg.cues.structure.trimming import trim
+from uni4d_fg.cues.structure.trimming import _limit, trim
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import project, world_to_camera
 from uni4d_fg.progress import SilentReporter
@@ -119,6 +119,18 @@ def test_without_points_nothing_is_trimmed() -> None:
     empty.position[:] = np.nan
     trim(empty)
     assert not empty.left_out.any()
+
+
+def test_where_all_that_has_a_point_is_left_out_the_limit_is_the_widest() -> None:
+    """As of a camera that stands still, whose points are behind it or in doubt: their noise is nobody's."""
+    grown = posed(swaying(6))
+    grown.leave_out(np.ones(grown.num_tracks, dtype=bool), grown.limit_px)
+    before = grown.limit_px.copy()
+    trim(grown)
+    assert np.isfinite(grown.limit_px).all()
+    assert np.all(grown.limit_px <= before)
+    empty = np.full(len(grown.observations), np.inf)
+    np.testing.assert_array_equal(_limit(grown, empty), grown.config.geometric_depth.max_reprojection_px)
 
 
 def panned(seed: int, frames: int = 50, count: int = 2500) -> tuple[TrackedScene, np.ndarray, np.ndarray]:

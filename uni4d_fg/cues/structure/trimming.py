@@ -105,10 +105,12 @@ def _noise(scene: GrowingScene, error: FloatArray) -> FloatArray:
     """Return the noise of a component of the observations in each frame (T,), px, by medians of the errors (N,).
 
     That of all observations, or of a frame that has more: what is blurred or turned fast is not to lose its camera.
+    Where nothing is seen of any point, it may be as large as it likes.
     """
     seen, frame = _seen(scene, error), scene.observations.frame
     own = median_per_row(error[seen], frame[seen], len(scene.registered))
-    return np.asarray(np.fmax(own, np.median(error[seen])) / MEDIAN_OF_NORM)
+    usual = np.median(error[seen]) if seen.any() else np.inf
+    return np.asarray(np.fmax(own, usual) / MEDIAN_OF_NORM)
 
 
 def _disagreeing(scene: GrowingScene, error: FloatArray, limit_px: FloatArray) -> BoolArray:
