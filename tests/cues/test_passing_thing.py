@@ -11,6 +11,7 @@ from cues.start_scenes import GUESS, SIZE, K, observed
 
 from uni4d_fg.config.load import load_config
 from uni4d_fg.cues.structure import search
+from uni4d_fg.cues.structure.first_pair import stands_still
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.motion import structure_from_motion
 from uni4d_fg.cues.structure.passing_thing import explains_more, most_left_over, only_seems_to_turn
@@ -102,6 +103,18 @@ def test_what_is_fixed_to_the_camera_is_not_the_world() -> None:
     """Outside a cabin that hides most of it, the world passes: that the cabin does not turn tells them apart."""
     cabin = passing(0, cabin=True)
     assert not is_passing(cabin, cabin.bus_T_cam)
+
+
+@pytest.mark.parametrize("points", [300, 800])
+def test_what_passes_a_camera_on_a_tripod_is_not_the_world(points: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of what is seen is a bus, and has parallax; the rest stays where it is. No scene is grown of it."""
+    tripod = passing(0, points=points, sway=0.0, turn=0.0)
+    monkeypatch.setattr(search.Search, "_grown_best", lambda *_: pytest.fail("scenes without baseline converge slowly"))
+    settings, still = CONFIG.geometric_depth, tripod.observations.track < points
+    assert stands_still(tripod.observations.select(still), FRAMES, settings)
+    assert not stands_still(tripod.observations.select(~still), FRAMES, settings)
+    observations = tripod.observations
+    assert structure_from_motion(observations, FRAMES, SIZE, GUESS, CONFIG, SilentReporter(), lambda: False) is None
 
 
 def test_what_most_of_the_tracks_agree_with_is_the_world() -> None:

@@ -98,6 +98,24 @@ def common_pixels(
             yield CommonPixels(first, second, observations.uv[a[used]], observations.uv[b[used]], len(a))
 
 
+def median_motions(observations: Observations, num_frames: int, config: GeometricDepthConfig) -> list[float]:
+    """Return how far the median track moves between any two of evenly spaced frames that share enough, px."""
+    return [
+        float(np.median(np.linalg.norm(seen.uv_second - seen.uv_first, axis=1)))
+        for seen in common_pixels(observations, num_frames, config.sampled_frames, config)
+    ]
+
+
+def stands_still(observations: Observations, num_frames: int, config: GeometricDepthConfig) -> bool:
+    """Tell whether most tracks stay where they are, which is no parallax at any focal length.
+
+    What moves before such a camera may be parallax of a quarter of the tracks all the same. Scenes of it have no
+    baseline, and hardly converge.
+    """
+    moved = median_motions(observations, num_frames, config)
+    return bool(moved) and max(moved) < config.min_parallax_px
+
+
 def has_parallax(pair: FramePair, config: GeometricDepthConfig) -> bool:
     """Tell whether two frames show parallax enough to start from."""
     least = config.min_parallax_px

@@ -15,7 +15,7 @@ import numpy as np
 
 from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.config.geometric_depth import GeometricDepthConfig
-from uni4d_fg.cues.structure.first_pair import common_pixels, has_parallax, rank_pairs
+from uni4d_fg.cues.structure.first_pair import has_parallax, median_motions, rank_pairs
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.hypotheses import at_sides
 from uni4d_fg.cues.structure.judging import errors_of
@@ -64,11 +64,7 @@ def only_seems_to_turn(
     pairs = rank_pairs(rest, num_frames, intrinsics, config, known_focal=known_focal)
     if any(has_parallax(pair, config) for pair in pairs):
         return False
-    moved = [
-        float(np.median(np.linalg.norm(seen.uv_second - seen.uv_first, axis=1)))
-        for seen in common_pixels(rest, num_frames, config.sampled_frames, config)
-    ]
-    return max(moved, default=0.0) >= _TURNED * config.min_parallax_px
+    return max(median_motions(rest, num_frames, config), default=0.0) >= _TURNED * config.min_parallax_px
 
 
 def _left_over(scene: GrowingScene, used: Observations) -> BoolArray:

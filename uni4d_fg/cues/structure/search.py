@@ -15,6 +15,7 @@ from uni4d_fg.cues.depth_settings import with_smaller_angles
 from uni4d_fg.cues.start_limits import OPEN_FOCAL
 from uni4d_fg.cues.structure.camera_search import FoundCamera, find_camera, lens_strength, needs_zoom
 from uni4d_fg.cues.structure.epipolar import epipolar_geometry
+from uni4d_fg.cues.structure.first_pair import stands_still
 from uni4d_fg.cues.structure.focal_interval import FocalInterval
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.growth import grow
@@ -138,7 +139,7 @@ class Search:
         self.reporter.begin("starting views", None)
         hypotheses = competition.run()
         self.reporter.end()
-        if not hypotheses:
+        if not hypotheses or stands_still(_agreeing(hypotheses[0].scene, used), self.num_frames, settings):
             return None
         scene, hypotheses = self._grown_best(competition, hypotheses, used)
         if _may_be_bent(scene) and (side := competition.at_sides()) is not None:
@@ -290,6 +291,11 @@ def _at_cameras(scene: GrowingScene, start: StartCameras) -> GrowingScene:
         scene, world_T_cam=start.world_T_cam, intrinsics=start.intrinsics,
         registered=np.ones(len(start.world_T_cam), dtype=bool),
     )  # fmt: skip
+
+
+def _agreeing(scene: GrowingScene, observations: Observations) -> Observations:
+    """Return all observations of the tracks that agree with a scene of some of them."""
+    return observations.select(np.isin(observations.track, scene.used()[0].track))
 
 
 def _if_solved(grow_other: Callable[[], SceneT | None]) -> SceneT | None:
