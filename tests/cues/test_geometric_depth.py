@@ -15,7 +15,7 @@ from uni4d_fg.config.geometric_depth import GeometricDepthConfig
 from uni4d_fg.config.load import load_config
 from uni4d_fg.config.synthetic import SyntheticSceneConfig
 from uni4d_fg.cues.depth_settings import settings_behind_lens, settings_for_depth
-from uni4d_fg.cues.geometric_depth import GeometricDepth, depth_from_motion
+from uni4d_fg.cues.geometric_depth import GeometricDepth, cut_off, depth_from_motion
 from uni4d_fg.cues.interpolated_depth import (
     SparseInverseDepth,
     enlarged,
@@ -285,6 +285,14 @@ def test_a_lone_wrong_point_has_no_support(rng: np.random.Generator) -> None:
     keep = supported(uv, inverse, GeometricDepthConfig())
     assert not keep[7]
     assert keep.sum() >= 98
+
+
+def test_things_whose_depth_nothing_shows_are_named_in_one_warning() -> None:
+    assert cut_off([]) == []
+    (one,) = cut_off([5])
+    assert one.startswith("the depth of moving thing 5 is a guess: the image cuts it off below")
+    (some,) = cut_off(list(range(1, 13)))
+    assert "moving things 1, 2, 3, 4, 5, 6, 7, 8, 9, 10 and 2 more is a guess: the image cuts them off" in some
 
 
 def test_moving_things_stand_at_the_depth_of_the_ground_below_them(rng: np.random.Generator) -> None:

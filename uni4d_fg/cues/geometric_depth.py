@@ -43,6 +43,7 @@ from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
 from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.calibration import unusual_focal
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
+from uni4d_fg.frontend.sequence.problems import some_of
 from uni4d_fg.frontend.track_model import Tracks
 from uni4d_fg.geometry.camera import NEAR_PLANE, project, world_to_camera
 from uni4d_fg.geometry.se3 import so3_log
@@ -349,12 +350,19 @@ def _place(
         f"moving thing {label} is {ratio:.1f} times nearer than what is seen below it, as the camera's shake tells"
         for label, ratio in placed.nearer.items()
     ]
-    warnings = [
-        f"the depth of moving thing {label} is a guess: the image cuts it off below, and the camera's motion does not "
-        "show how far it is. Give depth maps or a depth network for it"
-        for label in placed.open
+    return replace(depths, masks=video.masks, standing=placed.inverse_depth), facts, cut_off(placed.open)
+
+
+def cut_off(things: list[int]) -> list[str]:
+    """Return what to warn of where nothing shows the depth of some moving things, by their labels."""
+    if not things:
+        return []
+    one = len(things) == 1
+    named, them, they_are = ("thing", "it", "it is") if one else ("things", "them", "they are")
+    return [
+        f"the depth of moving {named} {some_of(things, 10)} is a guess: the image cuts {them} off below, and the "
+        f"camera's motion does not show how far {they_are}. Give depth maps or a depth network for {them}"
     ]
-    return replace(depths, masks=video.masks, standing=placed.inverse_depth), facts, warnings
 
 
 def _without_parallax(
