@@ -21,7 +21,7 @@ from uni4d_fg.cues.pixel_grid import PixelGrid
 from uni4d_fg.cues.static_scene import predict_static, relative_pose
 from uni4d_fg.cues.track_motion import Cameras, TrackMotion, find_moving_tracks
 from uni4d_fg.errors import Cancelled, InputError
-from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
+from uni4d_fg.frontend.sequence.model import ArrayFrames, Content, Video
 from uni4d_fg.frontend.sequence.read import read_sequence
 from uni4d_fg.frontend.synthetic import Simulation, SyntheticSceneConfig, simulate
 from uni4d_fg.frontend.track_model import LabelledTracks, Tracks
@@ -41,7 +41,7 @@ def video_of(simulation: Simulation) -> Video:
 
 def masks_of(
     simulation: Simulation, depths: np.ndarray | None = None, tracks: Tracks | None = None,
-    world_T_cam: np.ndarray | None = None, is_interpolated: bool = False,
+    world_T_cam: np.ndarray | None = None, is_interpolated: bool = False, content: Content | None = None,
 ) -> MotionMasks:  # fmt: skip
     sequence = simulation.sequence
     tracks = sequence.tracks if tracks is None else tracks
@@ -49,8 +49,9 @@ def masks_of(
     # The images are small.
     config = MotionMaskConfig(baselines=(2, 5), depth_edge_px=7, smoothing_px=6, grow_px=1)
     source = sequence.depths if depths is None else ArrayFrames(depths)
+    video = dataclasses.replace(video_of(simulation), content=content)
     return motion_masks(
-        video_of(simulation), source, tracks, sequence.intrinsics, config, world_T_cam=world_T_cam,
+        video, source, tracks, sequence.intrinsics, config, world_T_cam=world_T_cam,
         is_interpolated=is_interpolated,
     )  # fmt: skip
 
@@ -280,6 +281,15 @@ def test_moving_things_are_masked(moving_scene: Simulation, moving_result: Motio
     moves = moving_scene.tracks.instance > 0
     assert moving_result.tracks.moving[moves].mean() > 0.9
     assert moving_result.tracks.moving[~moves].mean() < 0.12
+
+
+def test_nothing_is_masked_in_black_bars(moving_scene: Simulation, moving_result: MotionMasks) -> None:
+    seen, whole = np.s_[:, 50:80], np.stack(list(moving_result.labels)) > 0
+    found = np.stack(list(masks_of(moving_scene, content=Content(50, 80, 0, 160)).labels)) > 0
+    assert whole[:, :48].any()
+    assert not found[:, :48].any()
+    assert not found[:, 82:].any()
+    assert overlap(found[seen], moving_scene.masks[seen]) > 0.65
 
 
 def test_the_cameras_are_not_drawn_to_what_moves(moving_scene: Simulation, moving_result: MotionMasks) -> None:

@@ -32,7 +32,8 @@ def first_look(
     """
     comparison = NeighborComparison(given, config)
     for frame, looked in enumerate(_looked_at(comparison, config.smoothing_px, stop)):
-        region = _trusted(_above_threshold(looked.evidence, given, config), frame, given, config).any(axis=0)
+        moves = _between_bars(_above_threshold(looked.evidence, given, config), given)
+        region = _trusted(moves, frame, given, config).any(axis=0)
         small = cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST)
         yield np.packbits(small)
 
@@ -50,6 +51,7 @@ def second_look(
     for frame, (image, evidence, _) in enumerate(looked):
         region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
         region = end_at_colors(region, image, evidence, given.tracks, given.motion, frame, comparison.scale, config)
+        region = _between_bars(region, given)
         masks = grown(_trusted(region, frame, given, config), config.grow_px)
         yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
 
@@ -66,6 +68,16 @@ def _looked_at(
 
 def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:
     return moving_region(smooth, given.video.image_size, given.threshold(config), config)
+
+
+def _between_bars(region: BoolArray, given: ComparedVideo) -> BoolArray:
+    """Return what of a region (H, W) is no black bar: bars seem to move where the scene does."""
+    content = given.video.content
+    if content is None:
+        return region
+    inside = np.zeros_like(region)
+    inside[content.slices] = region[content.slices]
+    return inside
 
 
 def _trusted(region: BoolArray, frame: int, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:

@@ -43,6 +43,8 @@ _FAR_FOCAL, _SHARPER_FOR_IT = 1.5, 0.97
 """A lens that changes an open focal length by more than this factor must leave sharpest errors of at most this part of
 the pinhole's: for lenses that were right they were 0.53 to 1.04, the focal length up to 1.39 times as long without; on
 a recording whose focal length a lens halves, they were 1.003."""
+_FEWER = 2
+"""Of a scene that is a trial one in so many of the tracks is used."""
 _HARDLY_TRIMMED = 0.8
 """Part of ``max_reprojection_px`` at which a limit that follows the noise is about where it began."""
 _MOST_AGREE = 0.8
@@ -99,22 +101,21 @@ class Search:
     is_pan: bool
     """Whether the view moves on, see :func:`~uni4d_fg.cues.structure.sweep.sweeps`."""
     start: StartCameras | None = None
+    is_trial: bool = False
+    """Whether scenes only have to tell another camera from a pinhole's, to which they are fitted: they are grown from
+    fewer tracks and not refined to the end, and nobody asks whether something that moves has bent them."""
 
-    def grow(
-        self, observations: Observations, intrinsics: FloatArray, free_focal: bool, *, is_trial: bool = False
-    ) -> Grown | None:
-        """Let starts compete, and grow and trim the best; None if no two frames have parallax, but for what passes.
-
-        Whether something that passes was taken for the world is not asked of a trial, which is judged beside others.
-        """
+    def grow(self, observations: Observations, intrinsics: FloatArray, free_focal: bool) -> Grown | None:
+        """Let starts compete, and grow and trim the best; None if no two frames have parallax, but for what passes."""
         settings = self.config.geometric_depth
-        used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
+        count = settings.max_tracks // _FEWER if self.is_trial else settings.max_tracks
+        used = observations.select(spread_tracks(observations, self.image_size, count))
         closer = replace(self, config=with_smaller_angles(self.config, float(intrinsics[0])))
         first = closer if self.is_pan else self
         found = first._grown(used, intrinsics, free_focal)
         if found is None and first.config != closer.config:  # The camera may hardly move.
             found = closer._grown(used, intrinsics, free_focal)
-        rest = None if found is None or is_trial else most_left_over(found.scene, used, self.image_size)
+        rest = None if found is None or self.is_trial else most_left_over(found.scene, used, self.image_size)
         if found is None or rest is None:
             return found
         world = _if_solved(lambda: replace(first, start=None)._grown(rest, intrinsics, free_focal))
@@ -125,7 +126,7 @@ class Search:
 
     def trial(self, observations: Observations, intrinsics: FloatArray) -> GrowingScene | None:
         """Return what grows with focal lengths that are held, to be judged beside others; None if nothing does."""
-        grown = self.grow(observations, intrinsics, free_focal=False, is_trial=True)
+        grown = replace(self, is_trial=True).grow(observations, intrinsics, free_focal=False)
         return None if grown is None else grown.scene
 
     def _grown(self, used: Observations, intrinsics: FloatArray, free_focal: bool) -> Grown | None:
@@ -142,7 +143,7 @@ class Search:
         if not hypotheses or stands_still(_agreeing(hypotheses[0].scene, used), self.num_frames, settings):
             return None
         scene, hypotheses = self._grown_best(competition, hypotheses, used)
-        if _may_be_bent(scene) and (side := competition.at_sides()) is not None:
+        if not self.is_trial and _may_be_bent(scene) and (side := competition.at_sides()) is not None:
             other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
             if other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, side.pair)]
@@ -190,7 +191,7 @@ class Search:
 
     def _grown_to_the_end(self, scene: GrowingScene) -> GrowingScene:
         grow(scene, self.reporter)
-        trim_and_converge(scene)
+        (trim if self.is_trial else trim_and_converge)(scene)
         return nearer_to_the_tracks(scene)
 
     def told_by_pairs(self, observations: Observations) -> CameraModel | None:
