@@ -43,8 +43,6 @@ _FAR_FOCAL, _SHARPER_FOR_IT = 1.5, 0.97
 """A lens that changes an open focal length by more than this factor must leave sharpest errors of at most this part of
 the pinhole's: for lenses that were right they were 0.53 to 1.04, the focal length up to 1.39 times as long without; on
 a recording whose focal length a lens halves, they were 1.003."""
-_FEWER = 2
-"""Of a scene that is a trial one in so many of the tracks is used."""
 _HARDLY_TRIMMED = 0.8
 """Part of ``max_reprojection_px`` at which a limit that follows the noise is about where it began."""
 _MOST_AGREE = 0.8
@@ -102,14 +100,13 @@ class Search:
     """Whether the view moves on, see :func:`~uni4d_fg.cues.structure.sweep.sweeps`."""
     start: StartCameras | None = None
     is_trial: bool = False
-    """Whether scenes only have to tell another camera from a pinhole's, to which they are fitted: they are grown from
-    fewer tracks and not refined to the end, and nobody asks whether something that moves has bent them."""
+    """Whether scenes are fitted to another camera in any case: they are not refined to the end, and nobody asks whether
+    something that moves has bent them, or passes."""
 
     def grow(self, observations: Observations, intrinsics: FloatArray, free_focal: bool) -> Grown | None:
         """Let starts compete, and grow and trim the best; None if no two frames have parallax, but for what passes."""
         settings = self.config.geometric_depth
-        count = settings.max_tracks // _FEWER if self.is_trial else settings.max_tracks
-        used = observations.select(spread_tracks(observations, self.image_size, count))
+        used = observations.select(spread_tracks(observations, self.image_size, settings.max_tracks))
         closer = replace(self, config=with_smaller_angles(self.config, float(intrinsics[0])))
         first = closer if self.is_pan else self
         found = first._grown(used, intrinsics, free_focal)
