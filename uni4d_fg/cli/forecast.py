@@ -234,6 +234,7 @@ def _motion(add: Callable[[str, float, float], None]) -> None:
     """Add the tasks of depth from camera motion."""
     add("starting views", 0.62, 0.028)
     add("structure from motion", 0.19, 0.031)
-    add("focal lengths", 0.43, 0.028)
+    add("camera refinement", 0.36, 0.02)
+    add("focal lengths", 0.07, 0.008)
     add("depth of moving things", 0.22, 0.045)
     add("depth maps", 0.12, 0.045)

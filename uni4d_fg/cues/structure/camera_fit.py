@@ -110,8 +110,18 @@ class TrackJudge:
         return 1.0 - float(ours.sum() / max(theirs.sum(), 1e-300)), float(np.mean(ours < theirs))
 
 
-def fit_lens(start: Fitted, model: LensModel, config: Config, options: dict[str, float]) -> Fitted:
-    """Free the intrinsics, and then the parameters of a lens as well; the evidence is what the second takes away."""
+def fit_lens(
+    start: Fitted, model: LensModel, config: Config, options: dict[str, float], *, settled: bool = False
+) -> Fitted:
+    """Free the intrinsics and the parameters of a lens.
+
+    Args:
+        start: Cameras to begin with.
+        model: Of the lens.
+        config: What the solve reads.
+        options: Changes of the solver's settings.
+        settled: First solve with the lens as it is, so that the evidence is of its parameters alone.
+    """
     bundle = _Bundle.of(start.scene)
     camera = np.concatenate([start.scene.intrinsics, start.camera.lens.padded])
     problem, state = lens_problem(
@@ -123,10 +133,11 @@ def fit_lens(start: Fitted, model: LensModel, config: Config, options: dict[str,
     unused = range(4 + len(PARAMETERS[model]), 8)
     known = range(4 if model == "SIMPLE_RADIAL" else 5, 8)
     stop = start.scene.should_stop
-    state, before = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *known]), state, solver, stop)
-    state, after = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *unused]), state, solver, stop)
-    found = state[OPENCV_CAMERA][0]
-    evidence = (before.final_energy - after.final_energy) / max(before.final_energies["static_reprojection"], 1e-300)
+    if settled:
+        state, _ = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *known]), state, solver, stop)
+    state, summary = _solve(replace(problem).fix(OPENCV_CAMERA, entries=[*pixel, *unused]), state, solver, stop)
+    found, before = state[OPENCV_CAMERA][0], summary.initial_energies["static_reprojection"]
+    evidence = (summary.initial_energy - summary.final_energy) / max(before, 1e-300)
     scene = bundle.moved(start.scene, state, found[:4])
     return Fitted(CameraModel(scene.intrinsics, Lens.of(model, found[4:])), scene, evidence)
 

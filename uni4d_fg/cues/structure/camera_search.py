@@ -106,7 +106,8 @@ def find_camera(
         proposed = None
     similar = similar_zoom(scene, image_size) if asks_for_zoom(plain, config) else None
     asks_for_lens = settings.model == "auto" and (
-        told is not None or fit_lens(plain, "SIMPLE_RADIAL", config, probing(config)).evidence >= _MIN_LENS_EVIDENCE
+        told is not None
+        or fit_lens(plain, "SIMPLE_RADIAL", config, probing(config), settled=True).evidence >= _MIN_LENS_EVIDENCE
     )
     if proposed is None and similar is None and not asks_for_lens:
         return None
@@ -206,5 +207,5 @@ def _with_lens(found: Fitted, rival: Fitted, judge: TrackJudge, config: Config) 
             break
     if first == "RADIAL":
         return found
-    richer = fit_lens(found, "RADIAL", config, to_the_end)
+    richer = fit_lens(found, "RADIAL", config, to_the_end, settled=True)
     return found if richer.evidence < _MIN_SECOND_EVIDENCE else judge.anew(richer)

@@ -42,8 +42,12 @@ def halves_agree_on_lens(lens: Fitted, image_size: tuple[int, int], config: Conf
         Cancelled: If asked to stop.
     """
     whole = bend(lens.camera, image_size)
-    found = _fitted_to_halves(lens, lambda half: fit_lens(half, lens.camera.lens.model, config, _OPTIONS))
-    return _agree([bend(one.camera, image_size) / whole - 1.0 for one in found])
+
+    def off(half: Fitted) -> float:
+        found = fit_lens(half, lens.camera.lens.model, config, _OPTIONS)
+        return bend(found.camera, image_size) / whole - 1.0
+
+    return _halves_agree(lens, off)
 
 
 def halves_agree_on_zoom(zoom: Fitted, config: Config) -> bool:
@@ -57,10 +61,13 @@ def halves_agree_on_zoom(zoom: Fitted, config: Config) -> bool:
         Cancelled: If asked to stop.
     """
     whole = _log_zoom(zoom)
-    found = _fitted_to_halves(zoom, lambda half: fit_zoom(half, config, _OPTIONS))
-    # The level of a focal length is another matter than its change, and less certain.
-    off = [np.std((_log_zoom(one) - whole)[one.scene.registered]) for one in found]
-    return _agree([float(deviation / np.std(whole)) for deviation in off])
+
+    def off(half: Fitted) -> float:
+        found = fit_zoom(half, config, _OPTIONS)
+        # The level of a focal length is another matter than its change, and less certain.
+        return float(np.std((_log_zoom(found) - whole)[found.scene.registered]) / np.std(whole))
+
+    return _halves_agree(zoom, off)
 
 
 def bend(camera: CameraModel, image_size: tuple[int, int]) -> float:
@@ -85,18 +92,21 @@ def halves(observations: Observations) -> list[BoolArray]:
     return [part for one in (late, right, lower) for part in (~one, one)]
 
 
-def _fitted_to_halves(whole: Fitted, fit: Callable[[Fitted], Fitted]) -> list[Fitted]:
-    """Return what is fitted to each half of the tracks; too few to be solved say nothing."""
-    found = []
-    for half in halves(whole.scene.observations):
+def _halves_agree(whole: Fitted, off: Callable[[Fitted], float]) -> bool:
+    """Tell whether what is fitted to halves is near to what all tracks ask for.
+
+    Args:
+        whole: Fitted to all.
+        off: Fits a half, and returns by which part of the whole it is off. Too few tracks to be solved say nothing.
+    """
+    parts = halves(whole.scene.observations)
+    squares = list[float]()
+    for part in parts:
         with suppress(SolverError):
-            found.append(fit(_restricted(whole, half)))
-    return found
-
-
-def _agree(off: list[float]) -> bool:
-    """Tell whether halves are near to the whole, from by which part of it each is off."""
-    return not off or float(np.sqrt(np.mean(np.square(off)))) <= _DISAGREE
+            squares.append(off(_restricted(whole, part)) ** 2)
+        if sum(squares) > len(parts) * _DISAGREE**2:
+            return False  # whatever the others say
+    return not squares or float(np.sqrt(np.mean(squares))) <= _DISAGREE
 
 
 def _log_zoom(fitted: Fitted) -> FloatArray:

@@ -188,8 +188,11 @@ class Search:
 
     def _grown_to_the_end(self, scene: GrowingScene) -> GrowingScene:
         grow(scene, self.reporter)
+        self.reporter.begin("camera refinement", None)
         (trim if self.is_trial else trim_and_converge)(scene)
-        return nearer_to_the_tracks(scene)
+        scene = nearer_to_the_tracks(scene)
+        self.reporter.end()
+        return scene
 
     def told_by_pairs(self, observations: Observations) -> CameraModel | None:
         """Return the lens that pairs of frames tell of a pan; None where they tell none, or none is looked for."""
