@@ -28,7 +28,7 @@ _PLAIN, _PLAINER = np.float32(0.008), 2
 a street, and a table before a plain wall."""
 _TOO_SURE, _LESS_SURE = np.float32(2.6), np.float32(0.62)
 """Odds beyond which depth from motion alone is right less often than they say, and the power of what is beyond: fitted
-to fifteen clips of two renderers."""
+to fifteen rendered clips."""
 _EDGE_WINDOW = np.ones((5, 5), np.uint8)
 _STEEPEST = np.float32(0.3)
 _UNBENT, _BENT_WEIGHT = np.float32(1.0), np.float32(-2.2)
