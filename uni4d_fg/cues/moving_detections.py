@@ -17,6 +17,7 @@ from uni4d_fg.cues.frame_comparison import ComparedVideo
 from uni4d_fg.cues.moving_regions import grown, moving_region, smoothed_evidence, trusted_components
 from uni4d_fg.cues.neighbor_comparison import NeighborComparison
 from uni4d_fg.cues.region_colors import end_at_colors
+from uni4d_fg.frontend.sequence.bars import only_content
 
 PackedMask = npt.NDArray[np.uint8]
 """A mask (h, w) at working size, packed by :func:`numpy.packbits`."""
@@ -73,11 +74,7 @@ def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionM
 def _between_bars(region: BoolArray, given: ComparedVideo) -> BoolArray:
     """Return what of a region (H, W) is no black bar: bars seem to move where the scene does."""
     content = given.video.content
-    if content is None:
-        return region
-    inside = np.zeros_like(region)
-    inside[content.slices] = region[content.slices]
-    return inside
+    return region if content is None else only_content(region, content, 0)
 
 
 def _trusted(region: BoolArray, frame: int, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:

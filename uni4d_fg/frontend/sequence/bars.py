@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from uni4d_fg.arrays import Float32Array, ImageArray, Int32Array, evenly_spread
+from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray, Int32Array, evenly_spread
 from uni4d_fg.frontend.sequence.frames import LazyFrames, where_of
 from uni4d_fg.frontend.sequence.model import Content, FrameSource, Sequence, Video
 from uni4d_fg.frontend.track_model import Tracks
@@ -34,6 +34,7 @@ _LEAST_CONTENT = 0.4
 """Part of each side that is left, at least."""
 
 _VideoT = TypeVar("_VideoT", Video, Sequence)
+_MapT = TypeVar("_MapT", Float32Array, Int32Array, BoolArray)
 
 
 def _brightest_channel(image: ImageArray) -> ImageArray:
@@ -81,6 +82,13 @@ def _bar(brightest: ImageArray) -> int:
     return 0
 
 
+def only_content(values: _MapT, content: Content, outside: float) -> _MapT:
+    """Return a map (H, W) with another value in the bars."""
+    kept = np.full_like(values, outside)
+    kept[content.slices] = values[content.slices]
+    return kept
+
+
 class InsideFrames(LazyFrames[Float32Array]):
     """Maps of which only the content is kept; NaN elsewhere."""
 
@@ -95,11 +103,7 @@ class InsideFrames(LazyFrames[Float32Array]):
         return where_of(self.source, frame)
 
     def _read(self, frame: int) -> Float32Array:
-        array = self.source[frame]
-        inside = self.content.slices
-        kept = np.full_like(array, np.nan)
-        kept[inside] = array[inside]
-        return kept
+        return only_content(self.source[frame], self.content, np.nan)
 
 
 class StaticOutside(LazyFrames[Int32Array]):
@@ -116,11 +120,7 @@ class StaticOutside(LazyFrames[Int32Array]):
         return where_of(self.source, frame)
 
     def _read(self, frame: int) -> Int32Array:
-        array = self.source[frame]
-        inside = self.content.slices
-        kept = np.zeros_like(array)
-        kept[inside] = array[inside]
-        return kept
+        return only_content(self.source[frame], self.content, 0)
 
 
 class CroppedFrames(LazyFrames[ImageArray]):
