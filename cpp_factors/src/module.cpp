@@ -22,7 +22,7 @@ NB_MODULE(_core, module) {
   // Objects that outlive the interpreter's own clean-up (in a failed test, say) are no reason to print.
   nb::set_leak_warnings(false);
   // Raised by every new entry point and every change of a signature or of a meaning.
-  module.attr("ABI") = 14;
+  module.attr("ABI") = 15;
   uni4d_fg::bind_factor_types(module);
   uni4d_fg::bind_whitening(module);
   uni4d_fg::bind_pair_system(module);

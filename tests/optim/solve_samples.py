@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 
@@ -15,11 +17,13 @@ from uni4d_fg.factors.priors import difference_jacobian, intrinsics_prior, log_s
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.static_reprojection import static_reprojection
 from uni4d_fg.factors.temporal_smoothness import acceleration_smoothness
-from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.factors.variable_types import DYNAMIC_POINT, INTRINSICS, LANDMARK, LOG_SCALE, POSE, ZOOM
+from uni4d_fg.factors.zoom import zoom_smoothness, zoomed_reprojection
 from uni4d_fg.geometry import se3
 from uni4d_fg.geometry.camera import camera_to_world, project, unproject, world_to_camera
 from uni4d_fg.optim.problem import Problem, all_free
 
+Sample = tuple[Problem, State]
 K = np.array([500.0, 505.0, 320.0, 240.0])
 
 
@@ -238,3 +242,34 @@ def free_mask(problem: Problem, state: State, groups: list[VariableType]) -> np.
         shape = (len(state[group]), group.dim)
         masks.append(np.asarray(problem.free.get(group, np.zeros(shape, dtype=bool))).reshape(-1))
     return np.concatenate(masks)
+
+
+def through_a_lens(sample: Sample, kind: FactorType) -> Sample:
+    """Every observation through a lens, whose second parameter is held at zero."""
+    problem, state = sample
+    variable, free = kind.variables[2], dict(problem.free)
+    arrays = {v: array for v, array in state.arrays.items() if v is not INTRINSICS}
+    camera = np.concatenate([state[INTRINSICS], [[-0.1, 0.0, 1e-3, -1e-3]]], axis=1)
+    del free[INTRINSICS]
+    free[variable] = np.array([[True] * 5 + [False] + [True] * 2])
+    first, *others = (b for b in problem.batches if b.factor_type is not intrinsics_prior)
+    camera_slot = Slot(variable, np.zeros(len(first), dtype=np.int64))
+    lens = replace(first, factor_type=kind, slots=(*first.slots[:2], camera_slot))
+    return replace(problem, batches=(lens, *others), free=free), State({variable: camera, **arrays}, state.index)
+
+
+def zooming(sample: Sample, *, with_depth: bool = True) -> Sample:
+    """Every frame with a focal length of its own, that of the first held; without depth no log-scale is left."""
+    problem, state = sample
+    count = len(state[POSE])
+    zoom = np.random.default_rng(1).normal(scale=0.05, size=(count, 1))
+    free = {**problem.free, ZOOM: np.arange(count)[:, None] > 0}
+    arrays = {**state.arrays, ZOOM: zoom}
+    first, *others = problem.batches
+    if not with_depth:
+        del free[LOG_SCALE], arrays[LOG_SCALE]
+        others = [batch for batch in others if all(slot.variable is not LOG_SCALE for slot in batch.slots)]
+    zoomed = replace(first, factor_type=zoomed_reprojection, slots=(*first.slots, Slot(ZOOM, first.slots[0].rows)))
+    rows = np.arange(count - 1)
+    smooth = FactorBatch.create(zoom_smoothness, (Slot(ZOOM, rows), Slot(ZOOM, rows + 1)), sigma=0.05)
+    return replace(problem, batches=(zoomed, *others, smooth), free=free), State(arrays, state.index)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solve_samples import LANDMARK_PRIOR, POINT_PRIOR, bundle, pair_terms
+from solve_samples import LANDMARK_PRIOR, POINT_PRIOR, Sample, bundle, pair_terms, through_a_lens, zooming
 
 from uni4d_fg.config.solver import SolverConfig
 from uni4d_fg.errors import SolverError
@@ -36,7 +36,6 @@ TIE = FactorType(
     lambda landmark, point: (point - landmark, [-identity(len(point)), identity(len(point))]), listed=False,
 )  # fmt: skip
 DAMPING = 1e-3
-Sample = tuple[Problem, State]
 
 
 def identity(count: int) -> np.ndarray:
@@ -194,20 +193,6 @@ def moving_points(rng: np.random.Generator) -> Sample:
     return replace(problem, batches=(*problem.batches, tie, prior), free=free), state
 
 
-def through_a_lens(sample: Sample, kind: FactorType) -> Sample:
-    """Every observation through a lens, whose second parameter is held at zero."""
-    problem, state = sample
-    variable, free = kind.variables[2], dict(problem.free)
-    arrays = {v: array for v, array in state.arrays.items() if v is not INTRINSICS}
-    camera = np.concatenate([state[INTRINSICS], [[-0.1, 0.0, 1e-3, -1e-3]]], axis=1)
-    del free[INTRINSICS]
-    free[variable] = np.array([[True] * 5 + [False] + [True] * 2])
-    first, *others = (b for b in problem.batches if b.factor_type is not intrinsics_prior)
-    camera_slot = Slot(variable, np.zeros(len(first), dtype=np.int64))
-    lens = replace(first, factor_type=kind, slots=(*first.slots[:2], camera_slot))
-    return replace(problem, batches=(lens, *others), free=free), State({variable: camera, **arrays}, state.index)
-
-
 def kernels(kind: str) -> Callable[[np.random.Generator], Sample]:
     kernel = Kernel(kind, 0.7)  # type: ignore[arg-type]
     return lambda rng: changed(scene(rng), lambda b: replace(b, kernel=kernel))
@@ -239,6 +224,12 @@ SAMPLES: dict[str, Callable[[np.random.Generator], Sample]] = {
         log_scale=[1, 2],
         landmark=slice(0, 90, 4),
     ),
+    "zoom": lambda rng: zooming(scene(rng, depth=False)),
+    "zoom in a long sequence": lambda rng: zooming(long_sequence(rng), with_depth=False),
+    "zoom and log-scales": lambda rng: zooming(scene(rng)),
+    "zoom and frozen entries": lambda rng: frozen(
+        zooming(scene(rng, depth=False)), pose=(slice(2, 4), slice(1, 5)), zoom=[3], landmark=slice(0, 90, 4)
+    ),
     "frozen landmarks": lambda rng: frozen(scene(rng), landmark=slice(0, 90, 4)),
     "frozen intrinsics": lambda rng: frozen(scene(rng), intrinsics=None),
     "frozen center": lambda rng: frozen(scene(rng), intrinsics=(slice(None), slice(2, 4))),
@@ -257,6 +248,13 @@ def sample(request: pytest.FixtureRequest, rng: np.random.Generator) -> Sample:
 def relative(ours: np.ndarray, expected: np.ndarray) -> float:
     """Return the largest difference relative to the largest entry."""
     return float(np.abs(ours - expected).max(initial=0.0) / max(np.abs(expected).max(initial=0.0), 1e-300))
+
+
+def test_a_zoom_is_no_border_where_no_log_scale_stands(rng: np.random.Generator) -> None:
+    alone = CppSchurObjective(*zooming(long_sequence(rng), with_depth=False), CONFIG).columns
+    assert (alone.border, alone.size, alone.banded) == (4, 7 * 39, True)
+    beside = CppSchurObjective(*zooming(long_sequence(rng)), CONFIG).columns
+    assert (beside.border, beside.size) == (4 + 39, 6 * 39 + 40)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

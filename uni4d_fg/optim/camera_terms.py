@@ -1,9 +1,10 @@
 """The camera system of bundle adjustment: where its columns stand, and the factors that read no landmark.
 
 The core holds the free entries of pose and log-scale frame by frame, so that frames which share no landmark
-leave it banded. The shared intrinsics are its border, and after them every other variable that is free, of whatever
-type. Storage is LAPACK's lower triangle, one row of the array per column: entry (i, j), i >= j, stands at ``[j, i]`` of
-a dense core and at ``[j, i - j]`` of a banded one.
+leave it banded; where no factor reads a log-scale, the zoom of each frame takes its place. The shared intrinsics are
+its border, and after them every other variable that is free, of whatever type. Storage is LAPACK's lower triangle,
+one row of the array per column: entry (i, j), i >= j, stands at ``[j, i]`` of a dense core and at ``[j, i - j]`` of a
+banded one.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.factor_type import Linearized
 from uni4d_fg.factors.state import State
 from uni4d_fg.factors.variable import VariableType
-from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE
+from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, LOG_SCALE, POSE, ZOOM
 from uni4d_fg.optim.layout import DenseLayout
 from uni4d_fg.optim.problem import Problem
 
@@ -87,7 +88,9 @@ class CameraColumns:
     """The order of the camera system's columns, and its storage."""
 
     core: IntArray
-    """(T, 7) core column of each pose entry and log-scale; -1 if frozen."""
+    """(T, 7) core column of each pose entry and of the log-scale or zoom; -1 if frozen."""
+    of_frame: Mapping[VariableType, slice]
+    """Which of these seven a variable has."""
     layout_columns: IntArray
     """(n + b,) column in the dense layout of each column; -1 for frozen intrinsics."""
     extra: Mapping[VariableType, IntArray]
@@ -102,7 +105,8 @@ class CameraColumns:
         """Order the columns and measure how far apart frames that share a factor or a free landmark are."""
         free = np.zeros((num_frames, 7), dtype=bool)
         in_layout = np.full((num_frames, 7), -1)
-        for variable, columns in ((POSE, slice(0, 6)), (LOG_SCALE, slice(6, 7))):
+        of_frame = {POSE: slice(0, 6), _last_of_a_frame(problem, layout, num_frames): slice(6, 7)}
+        for variable, columns in of_frame.items():
             if variable in layout.offset:
                 in_layout[:, columns] = layout.columns(variable, np.arange(num_frames))
                 free[:, columns] = layout.free[in_layout[:, columns]]
@@ -115,7 +119,7 @@ class CameraColumns:
         extra: dict[VariableType, IntArray] = {}
         others, width = [np.zeros(0, dtype=np.int64)], size + INTRINSICS_COLUMNS
         for variable, count in layout.count.items():
-            if variable not in (POSE, LOG_SCALE, INTRINSICS):
+            if variable is not INTRINSICS and variable not in of_frame:
                 in_other = layout.columns(variable, np.arange(count))
                 movable = layout.free[in_other]
                 extra[variable] = np.where(movable, width + np.cumsum(movable).reshape(movable.shape) - 1, -1)
@@ -124,16 +128,16 @@ class CameraColumns:
         end = np.cumsum(free.sum(axis=1))
         start = end - free.sum(axis=1)
         width = int((end - start).max(initial=0))
-        first, last = _frame_range(problem, num_frames, landmark_free)
+        first, last = _frame_range(problem, num_frames, landmark_free, of_frame)
         seen = last >= 0
         width = max(width, int((end[last[seen]] - start[first[seen]]).max(initial=0)))
         for batch in problem.batches:
-            frames = [s.rows for s in batch.slots if s.variable in (POSE, LOG_SCALE) and s.variable in layout.offset]
+            frames = [s.rows for s in batch.slots if s.variable in of_frame and s.variable in layout.offset]
             if frames and len(batch):
                 width = max(width, int((end[np.max(frames, axis=0)] - start[np.min(frames, axis=0)]).max()))
         banded = width < _BAND_FRACTION * size
         layout_columns: IntArray = np.concatenate([in_layout[free], border, *others])
-        return cls(core, layout_columns, extra, size, width if banded else size, banded)
+        return cls(core, of_frame, layout_columns, extra, size, width if banded else size, banded)
 
     @property
     def border(self) -> int:
@@ -142,10 +146,8 @@ class CameraColumns:
 
     def of_slot(self, variable: VariableType, rows: IntArray) -> IntArray:
         """Return the columns (N, dim) of rows (N,) of a variable; border columns from n on; -1 if frozen."""
-        if variable == POSE:
-            return self.core[rows, :6]
-        if variable == LOG_SCALE:
-            return self.core[rows, 6:]
+        if variable in self.of_frame:
+            return self.core[rows, self.of_frame[variable]]
         if variable in self.extra:
             return self.extra[variable][rows]
         known = self.layout_columns[self.size : self.size + INTRINSICS_COLUMNS] >= 0
@@ -154,7 +156,7 @@ class CameraColumns:
 
     def has(self, variable: VariableType) -> bool:
         """Return whether a variable type stands in the camera system; landmarks do not."""
-        return variable in (POSE, LOG_SCALE, INTRINSICS) or variable in self.extra
+        return variable is INTRINSICS or variable in self.of_frame or variable in self.extra
 
     def diagonal(self, system: CameraSystem) -> FloatArray:
         """Return the diagonal of core and corner, (n + b,)."""
@@ -163,13 +165,25 @@ class CameraColumns:
         return np.concatenate([core, np.diag(system.corner)])
 
 
-def _frame_range(problem: Problem, num_frames: int, landmark_free: BoolArray) -> tuple[IntArray, IntArray]:
+def _last_of_a_frame(problem: Problem, layout: DenseLayout, num_frames: int) -> VariableType:
+    """Return what has the seventh column of each frame.
+
+    As a border, a zoom is as wide as the video is long: every landmark would be coupled with all of it.
+    """
+    is_zoom = layout.count.get(ZOOM) == num_frames and LOG_SCALE not in layout.count
+    reads_scale = any(slot.variable is LOG_SCALE for batch in problem.batches for slot in batch.slots)
+    return ZOOM if is_zoom and not reads_scale else LOG_SCALE
+
+
+def _frame_range(
+    problem: Problem, num_frames: int, landmark_free: BoolArray, of_frame: Mapping[VariableType, slice]
+) -> tuple[IntArray, IntArray]:
     """Return the first and the last frame that sees each free landmark; last is -1 where none does."""
     first, last = np.full(len(landmark_free), num_frames), np.full(len(landmark_free), -1)
     for batch in problem.batches:
         landmark = next((s.rows for s in batch.slots if s.variable is LANDMARK), None)
         for slot in batch.slots:
-            if landmark is not None and slot.variable in (POSE, LOG_SCALE):
+            if landmark is not None and slot.variable in of_frame:
                 np.minimum.at(first, landmark, slot.rows)
                 np.maximum.at(last, landmark, slot.rows)
     last[~landmark_free] = -1

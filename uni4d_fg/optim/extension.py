@@ -15,7 +15,7 @@ from uni4d_fg.errors import MissingDependencyError
 from uni4d_fg.factors.batch import FactorBatch
 from uni4d_fg.factors.state import State
 
-REQUIRED_ABI = 14
+REQUIRED_ABI = 15
 """Version of the extension's interface that this package speaks."""
 
 INSTALL_COMMAND = "pip install ./cpp_factors"

@@ -31,6 +31,9 @@ from uni4d_fg.slam.windows.plan import TrackSpans, calibration_frames
 
 _DAMPING = 1e-6
 """Of the probe: the scale of a scene is held by a weak prior only, so that steps are not quite undamped."""
+_LOOSER = 10
+"""Times the relative decrease of a joint solve at which cameras that are compared are solved: k1 changes by 0.00003, a
+focal length by 0.002 %."""
 _SETTLING = 2
 """So many times more steps are taken without a zoom before the probe: what they leave is 1.5 % of the energy after as
 many, 0.9 % after twice as many."""
@@ -227,6 +230,15 @@ class _Bundle:
         poses = scene.world_T_cam.copy()
         poses[self.frames] = state[POSE]
         return replace(scene, world_T_cam=poses, intrinsics=intrinsics.copy())
+
+
+def to_the_end(config: Config, max_iterations: int) -> dict[str, float]:
+    """Return the options of a solve that cameras are compared after.
+
+    What decides between them is a thousandth of the energy and more, and a camera that the tracks do not ask for is in
+    a valley along which a hundred more steps lower it by less than a twenty-thousandth.
+    """
+    return {"relative_decrease": _LOOSER * config.camera.relative_decrease, "max_iterations": max_iterations}
 
 
 def probing(config: Config) -> dict[str, float]:

@@ -21,7 +21,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_zoom, part_of, probing
+from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_zoom, part_of, probing, to_the_end
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_zoom
@@ -123,10 +123,10 @@ def find_zoom(
         found += anew(similar)
     if not found:
         return None
-    to_the_end = {"relative_decrease": config.camera.relative_decrease, "max_iterations": _STEPS}
+    options = to_the_end(config, _STEPS)
     costs = [judge.cost(one) for one in found]
     close = [number for number, cost in enumerate(costs) if cost <= (1.0 + _CLOSE) * min(costs)]
-    ends = {number: judge.anew(fit_zoom(found[number], config, to_the_end)) for number in close}
+    ends = {number: judge.anew(fit_zoom(found[number], config, options)) for number in close}
     cost_of = {number: judge.cost(end) for number, end in ends.items()}
     tied = [number for number in close if cost_of[number] <= (1.0 + _TIE) * min(cost_of.values())]
     # Cameras that were grown anew owe nothing to the plain ones, which are wrong: in a tie they are taken.
@@ -135,7 +135,7 @@ def find_zoom(
     for _ in range(1, _ROUNDS):
         if config.camera.zoom == "auto" and judge.better(best, plain)[1] < 0.5:
             return None
-        again = judge.anew(fit_zoom(best, config, to_the_end))
+        again = judge.anew(fit_zoom(best, config, options))
         cost_again = judge.cost(again)
         if cost_again > (1.0 + _LEADS_AWAY) * cost:
             break
