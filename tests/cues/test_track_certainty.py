@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.track_certainty import believed, position_variance, share_of_moving
@@ -77,6 +78,24 @@ def test_a_track_that_slides_along_an_edge_does_not_move() -> None:
     assert found.moving.tolist()[-2:] == [False, True]
     assert found.static[-2]
     assert not found.moving[:-2].any()
+
+
+@pytest.mark.parametrize(("noise_px", "least", "most"), [(0.1, 0.9, 1.0), (0.7, 0.0, 0.1)])
+def test_what_moves_by_little_is_told_where_tracks_are_that_exact(noise_px: float, least: float, most: float) -> None:
+    """A camera on a tripod, and somebody who walks away: 3 px within 20 frames."""
+    frames, resting, intrinsics = 24, 300, np.array([300.0, 300.0, 159.5, 119.5])
+    rng = np.random.default_rng(0)
+    uv = np.repeat(rng.uniform((10, 10), (310, 230), (resting + 30, 2))[:, None], frames, axis=1)
+    uv[resting:, :, 1] += 0.15 * np.arange(frames)
+    tracks = tracks_at(uv + rng.normal(0, noise_px, uv.shape))
+    count, still = len(uv), np.zeros(frames)
+    zero, seen = np.zeros(count, np.int32), np.ones((count, frames), np.float32)
+    labelled = LabelledTracks(tracks, zero, zero, seen, 2 * seen)
+    cameras = Cameras(np.tile(np.eye(4), (frames, 1, 1)), intrinsics, still)
+    found = find_moving_tracks(labelled, 0 * seen, cameras, SIZE, MotionMaskConfig(), np.zeros(count, bool))
+    assert least <= found.moving[resting:].mean() <= most
+    assert found.moving[:resting].mean() < 0.02
+    assert found.static[:resting].mean() > 0.9
 
 
 def test_tracks_that_contradict_are_believed_where_they_depart_or_those_around_do() -> None:

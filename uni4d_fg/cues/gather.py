@@ -280,8 +280,7 @@ class _Gathering:
         tracks = self._any_tracks()
         masks, facts, warnings = moving_masks(
             self.video, depths, tracks, self._best_camera(), self._key(), _name_of(depths), self.moving_tracks,
-            self.cameras_of_motion if self.motion_has_parallax else None, self.folder, self.config, self.reporter,
-            self.should_stop,
+            self.cameras_of_motion, self.folder, self.config, self.reporter, self.should_stop,
         )  # fmt: skip
         self.report.facts += [f"masks: {fact}" for fact in facts]
         self.report.warnings += warnings

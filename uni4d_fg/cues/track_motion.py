@@ -8,7 +8,9 @@ so that an error of depth explains what it can explain: motion along the epipola
 be wrong. What the image does not hold in place, ``S_image`` explains (:mod:`uni4d_fg.cues.track_certainty`).
 Where a track has no depth, sigma_z is large and only the distance from the epipolar line is left.
 What all tracks of a pair of frames share (an error of pose or focal length) is fitted robustly by a quadratic
-and taken off first.
+and taken off first. These sigmas are those of a hand-held camera and an uncertain depth; where tracks agree better with
+a static scene, as those of a camera on a tripod do, departures are taken in units of what three quarters of the tracks
+do not exceed.
 """
 
 from __future__ import annotations
@@ -29,6 +31,11 @@ _MEDIAN_OF_CHI2 = 1.386
 """With two degrees of freedom."""
 _PAIRS_AT_ONCE = 32
 """Pairs of frames whose quadratics are fitted together: more are no faster, and take memory."""
+
+_AT_REST = 0.75
+"""Part of the tracks that is taken to be at rest: the departure that it does not exceed measures the noise ..."""
+_NOISE = (0.3, 1.0)
+"""... within these bounds, in standard deviations of the configuration. Where more of them move, it is too high."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +92,7 @@ class TrackMotion:
     static: BoolArray
     """(K,) agrees with the static scene for sure; a track may be neither."""
     departure: FloatArray
-    """(K,) standard deviations, NaN where it was not tested."""
+    """(K,) standard deviations, of the tracks' own noise where that is less; NaN where it was not tested."""
     shared: dict[tuple[int, int], SharedError] = field(default_factory=dict)
     """(source, target) frame to what their tracks have in common."""
 
@@ -145,6 +152,7 @@ def find_moving_tracks(
         tested = count > 0
         pick = start + np.minimum((config.track_quantile * count).astype(np.int64), np.maximum(count - 1, 0))
         result[tested] = np.sqrt(squared[pick[tested]])
+        result /= np.clip(np.quantile(result[tested], _AT_REST), *_NOISE)
         moving = tested & (result > config.moving_sigmas)
         static = tested & (result < config.static_sigmas)
     return TrackMotion(moving, static, result, shared)

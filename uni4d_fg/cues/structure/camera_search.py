@@ -120,7 +120,7 @@ def find_camera(
         gain = judge.better(lens, plain)[0]
         is_beyond = lens_strength(lens.camera, image_size, config) is Strength.BEYOND
         if is_lens(lens.camera, image_size, gain, config) and halves_agree_on_lens(lens, image_size, config):
-            best = lens
+            best = judge.anew(_to_its_end(lens, config))
         elif gain >= (settings.min_evidence_unsure if is_beyond else _MUCH):
             denied_px = lens.camera.lens.displacement(lens.camera.intrinsics, image_size)
     if proposed is not None or similar is not None:
@@ -176,6 +176,13 @@ def _refined(plain: Fitted, judge: TrackJudge, config: Config) -> Fitted:
     except SolverError:
         return found
     return mirrored if judge.better(mirrored, found)[0] > 0.0 else found
+
+
+def _to_its_end(lens: Fitted, config: Config) -> Fitted:
+    """Fit a lens that was taken until it stays: compared with others it was before."""
+    settings = config.camera
+    options = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
+    return fit_lens(lens, lens.camera.lens.model, config, options)
 
 
 def _grown_with(
