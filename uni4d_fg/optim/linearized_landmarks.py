@@ -76,9 +76,9 @@ class LinearizedLandmarks:
         """Plan which landmarks and columns they touch."""
         self.batches, self.columns, self.free = batches, columns, landmark_free
         self._cameras = CameraTerms(batches, columns)
-        self._slot = [next(i for i, s in enumerate(b.slots) if s.variable is LANDMARK) for b in batches]
+        of_landmark = [next(i for i, s in enumerate(b.slots) if s.variable is LANDMARK) for b in batches]
         places, touched = [], [np.zeros(0, dtype=np.int64)]
-        for batch, i in zip(batches, self._slot, strict=True):
+        for batch, i in zip(batches, of_landmark, strict=True):
             others = [s for s in batch.slots if columns.has(s.variable) and s.variable not in columns.of_frame]
             places += [columns.of_slot(s.variable, s.rows).reshape(-1) for s in others]
             touched += [np.unique(batch.slots[i].rows)] if others else []
@@ -87,7 +87,7 @@ class LinearizedLandmarks:
         """Those that are coupled with a variable that is not of a frame."""
         used = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *places]))
         self._columns: IntArray = used[used >= 0]
-        self._coupled = [self._plan(batch, slot) for batch, slot in zip(batches, self._slot, strict=True)]
+        self._coupled = [self._plan(batch, slot) for batch, slot in zip(batches, of_landmark, strict=True)]
         self._coupling: FloatArray = np.zeros((0, 3, 0))
 
     def _plan(self, batch: FactorBatch, slot: int) -> _Coupled:
@@ -155,8 +155,8 @@ class LinearizedLandmarks:
     def pairs(self) -> tuple[IntArray, IntArray]:
         """Return the frames (P,) and landmarks (P,) that the factors couple, each pair once."""
         found, count = [np.zeros(0, dtype=np.int64)], max(len(self.free), 1)
-        for batch, slot in zip(self.batches, self._slot, strict=True):
-            landmark = batch.slots[slot].rows
+        for batch, coupled in zip(self.batches, self._coupled, strict=True):
+            landmark = batch.slots[coupled.slot].rows
             found += [s.rows * count + landmark for s in batch.slots if s.variable in self.columns.of_frame]
         frames, landmarks = np.divmod(np.unique(np.concatenate(found)), count)
         return frames, landmarks

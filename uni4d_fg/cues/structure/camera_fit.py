@@ -232,7 +232,7 @@ class _Bundle:
         return replace(scene, world_T_cam=poses, intrinsics=intrinsics.copy())
 
 
-def to_the_end(config: Config, max_iterations: int) -> dict[str, float]:
+def comparing(config: Config, max_iterations: int) -> dict[str, float]:
     """Return the options of a solve that cameras are compared after.
 
     What decides between them is a thousandth of the energy and more, and a camera that the tracks do not ask for is in

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 from uni4d_fg.arrays import Float32Array
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_lens, part_of, probing, to_the_end
+from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, comparing, fit_lens, part_of, probing
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_lens
 from uni4d_fg.cues.structure.reversal import exchanged_and_refined
@@ -202,7 +202,7 @@ def _with_lens(found: Fitted, rival: Fitted, judge: TrackJudge, config: Config) 
     Which tracks agree, and where they are triangulated, depends on the lens: it is fitted again until it stays, or
     until it explains much less than a rival.
     """
-    options = to_the_end(config, config.camera.max_iterations)
+    options = comparing(config, config.camera.max_iterations)
     first: LensModel = "RADIAL" if found.camera.lens.model == "RADIAL" else "SIMPLE_RADIAL"
     for _ in range(_LENS_ROUNDS):
         before = found.camera.lens.padded[0]

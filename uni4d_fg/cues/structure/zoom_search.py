@@ -21,7 +21,7 @@ import numpy as np
 
 from uni4d_fg.arrays import FloatArray
 from uni4d_fg.config.models import Config
-from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, fit_zoom, part_of, probing, to_the_end
+from uni4d_fg.cues.structure.camera_fit import Fitted, TrackJudge, comparing, fit_zoom, part_of, probing
 from uni4d_fg.cues.structure.first_pair import CommonTracks
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.lens_agreement import halves_agree_on_zoom
@@ -123,7 +123,7 @@ def find_zoom(
         found += anew(similar)
     if not found:
         return None
-    options = to_the_end(config, _STEPS)
+    options = comparing(config, _STEPS)
     costs = [judge.cost(one) for one in found]
     close = [number for number, cost in enumerate(costs) if cost <= (1.0 + _CLOSE) * min(costs)]
     ends = {number: judge.anew(fit_zoom(found[number], config, options)) for number in close}
