@@ -14,7 +14,7 @@ import numpy as np
 
 from uni4d_fg.arrays import Array, FloatArray, namespace
 from uni4d_fg.factors.factor_type import factor
-from uni4d_fg.factors.projection import chain_to_pose, chain_to_world_point, projection_derivatives
+from uni4d_fg.factors.static_reprojection import static_reprojection_jacobian
 from uni4d_fg.factors.variable_types import INTRINSICS, LANDMARK, POSE, ZOOM
 from uni4d_fg.geometry.camera import project, world_to_camera
 
@@ -36,15 +36,13 @@ def zoomed_reprojection_jacobian(
     world_T_cam: FloatArray, landmark: FloatArray, intrinsics: FloatArray, zoom: FloatArray, *, uv: FloatArray
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the residual and its Jacobians: pose (N, 2, 6), landmark (N, 2, 3), intrinsics (N, 2, 4), zoom (N, 2)."""
-    x = world_to_camera(world_T_cam, landmark)
     camera = np.asarray(zoomed_intrinsics(intrinsics, zoom))
-    pixel = np.asarray(project(camera, x))
-    by_x, by_camera = projection_derivatives(camera, x)
-    pose, point = chain_to_pose(by_x, x), chain_to_world_point(by_x, world_T_cam)
+    r, (pose, point, by_camera) = static_reprojection_jacobian(world_T_cam, landmark, camera, uv=uv)
+    # d(fx, fy)/dl is (fx, fy) of the frame; their derivatives by those of the intrinsics are e^l.
+    by_zoom = by_camera[:, :, :2] @ camera[:, :2, None]
     by_intrinsics = by_camera.copy()
     by_intrinsics[:, :, :2] *= np.exp(zoom)[:, None, :]
-    by_zoom = (pixel - camera[:, 2:])[:, :, None]
-    return uv - pixel, [-pose, -point, -by_intrinsics, -by_zoom]
+    return r, [pose, point, by_intrinsics, by_zoom]
 
 
 @factor(ZOOM, ZOOM, dim=1)
