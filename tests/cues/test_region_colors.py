@@ -1,4 +1,4 @@
-"""Regions that move end where colors do."""
+"""Colors tell what moves where evidence is blurred or silent."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 
 from uni4d_fg.config.motion_masks import MotionMaskConfig
-from uni4d_fg.cues.region_colors import end_at_colors
-from uni4d_fg.cues.track_motion import TrackMotion
-from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.cues.region_colors import NearRegion, color_odds
 
 SIZE = (180, 240)
 CONFIG = MotionMaskConfig()
+REACH = CONFIG.color_reach_px
 
 
-def walker() -> np.ndarray:
+def walker(left: int = 0, legs: bool = True) -> np.ndarray:
     """A body with a head and two legs, (H, W)."""
     mask = np.zeros(SIZE, np.uint8)
-    cv2.circle(mask, (120, 40), 12, 1, -1)
-    cv2.rectangle(mask, (102, 52), (138, 110), 1, -1)
-    cv2.rectangle(mask, (104, 110), (112, 160), 1, -1)
-    cv2.rectangle(mask, (126, 110), (134, 160), 1, -1)
+    cv2.circle(mask, (left + 60, 40), 12, 1, -1)
+    cv2.rectangle(mask, (left + 42, 52), (left + 78, 110), 1, -1)
+    if legs:
+        cv2.rectangle(mask, (left + 44, 110), (left + 52, 160), 1, -1)
+        cv2.rectangle(mask, (left + 66, 110), (left + 74, 160), 1, -1)
     return mask > 0
 
 
@@ -34,117 +34,92 @@ def picture(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(image + rng.normal(0, 6, image.shape), 0, 255).astype(np.uint8)
 
 
-def tracks_at(uv: list[tuple[float, float]]) -> tuple[Tracks, TrackMotion]:
-    """Static tracks in one frame."""
-    count = len(uv)
-    tracks = Tracks(
-        np.array(uv, np.float32).reshape(count, 1, 2), np.ones((count, 1), bool), np.zeros(count, np.int32)
-    )  # fmt: skip
-    return tracks, TrackMotion(np.zeros(count, bool), np.ones(count, bool), np.zeros(count))
+def blurred(mask: np.ndarray) -> np.ndarray:
+    """What is seen to move: without edges, and with a strip of the wall that is not quite sure."""
+    evidence = 8 * cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 2.5) - 4
+    evidence[60:66, 0:230] = np.maximum(evidence[60:66, 0:230], 1.5)
+    return np.asarray(evidence, np.float32)
 
 
-def ended(
-    region: np.ndarray, image: np.ndarray, uv: list[tuple[float, float]], evidence: np.ndarray | None = None,
-    **changes: int,
-) -> np.ndarray:  # fmt: skip
-    tracks, motion = tracks_at(uv)
-    config = CONFIG.model_copy(update=changes)
-    scale = np.array([image.shape[1] / region.shape[1], image.shape[0] / region.shape[0]])
-    evidence = np.ones(image.shape[:2], np.float32) if evidence is None else evidence
-    return end_at_colors(region, image, evidence, tracks, motion, 0, scale, config)
+def looked_at(image: np.ndarray, evidence: np.ndarray, reach_px: int = REACH, larger: int = 1) -> NearRegion:
+    region = cv2.resize((evidence > 0.25).astype(np.uint8), None, fx=larger, fy=larger, interpolation=cv2.INTER_NEAREST)
+    return NearRegion.of(region > 0, image, evidence, reach_px)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-BESIDE = [(60.0, 60.0), (180.0, 60.0), (60.0, 140.0), (180.0, 140.0)]
-
-
-def rough(mask: np.ndarray) -> np.ndarray:
-    """What evidence makes of the body: without head and feet, too wide, and with a strip of the wall."""
-    region = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 8) > 0.4
-    region[:45] = region[140:] = False
-    region[60:66, 138:170] = True
-    return region
-
-
 @pytest.mark.parametrize("larger", [1, 2])
-def test_head_and_legs_are_found_and_what_is_beside_goes(larger: int, rng: np.random.Generator) -> None:
-    truth = walker()
-    image = picture(truth, rng)
-    size = (SIZE[1] * larger, SIZE[0] * larger)
-    region, whole = (
-        cv2.resize(m.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for m in (rough(truth), truth)
-    )
-    uv = [(u * larger, v * larger) for u, v in BESIDE]
-    found = ended(region, image, uv)
-    assert found.shape == whole.shape
-    assert overlap(region, whole) < 0.75
-    assert overlap(found, whole) > 0.93
-    np.testing.assert_array_equal(ended(region, image, uv), found)  # nothing is left to chance
+def test_legs_that_stand_in_one_frame_have_moved_in_others(larger: int, rng: np.random.Generator) -> None:
+    frames, truth = [], []
+    for frame in range(6):
+        body = walker(20 * frame)
+        seen = walker(20 * frame, legs=frame % 2 == 1)
+        evidence = blurred(seen)
+        evidence[body & ~seen & (evidence < 0.25)] = -0.5
+        truth.append(body)
+        frames.append(looked_at(picture(body, rng), evidence, larger=larger))
+    odds = color_odds(frames, CONFIG)
+    for frame, (looked, body) in enumerate(zip(frames, truth, strict=True)):
+        moves = looked.moving(odds) > CONFIG.threshold
+        before = looked.moving(np.zeros_like(odds)) > 0.25
+        rows = slice(0, 125)  # as far as colors reach below what was found where the legs stand
+        legs = body[rows] & (np.arange(125)[:, None] >= 112)
+        assert overlap(moves[rows], body[rows]) > 0.97 > 0.85 > overlap(before[rows], body[rows])
+        assert moves[rows][legs].mean() > 0.9
+        if frame % 2 == 0:
+            assert before[rows][legs].mean() < 0.1
 
 
 def test_it_reaches_no_farther_than_said(rng: np.random.Generator) -> None:
-    truth = walker()
-    image, region = picture(truth, rng), rough(truth)
-    found = ended(region, image, BESIDE, color_reach_px=6)
-    near = (
-        cv2.dilate(region.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (19, 19))) > 0
-    )  # 6 and 2, and the corners of disks
-    assert not (found & ~near).any()
-    assert overlap(found, truth) > overlap(region, truth)
-    np.testing.assert_array_equal(ended(region, image, BESIDE, color_reach_px=0), region)
+    body = walker()
+    for reach in (0, 6):
+        looked = looked_at(picture(body, rng), blurred(body), reach)
+        region = (blurred(body) > 0.25).astype(np.uint8)
+        near = cv2.dilate(region, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)) > 0
+        np.testing.assert_array_equal(looked.mask, near)
+        found = looked.moving(np.full(32**3, 4.0, np.float32))
+        assert (found[~near] < -5).all()
+        np.testing.assert_allclose(
+            looked.evidence, np.clip(blurred(body)[near], -5.29, 5.29), atol=1 / 48 + 1e-6
+        )  # what is held is rounded
 
 
-def test_the_core_stays_even_in_the_colors_of_what_is_around(rng: np.random.Generator) -> None:
+def test_colors_that_both_have_say_nothing(rng: np.random.Generator) -> None:
     image = np.clip(rng.normal(120, 6, (*SIZE, 3)), 0, 255).astype(np.uint8)
-    region = np.zeros(SIZE, bool)
-    region[40:140, 90:150] = True
-    found = ended(region, image, BESIDE)
-    core = cv2.erode(region.astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
-    assert found[core].all()
+    body = walker()
+    looked = looked_at(image, blurred(body))
+    odds = color_odds([looked], CONFIG)
+    said = looked.colored(odds)[1] - looked.evidence
+    assert np.abs(said).mean() < 0.3
+    assert overlap(looked.moving(odds) > 0.25, blurred(body) > 0.25) > 0.9
 
 
-def test_around_a_static_track_nothing_moves(rng: np.random.Generator) -> None:
-    truth = walker()
-    image, region = picture(truth, rng), rough(truth)
-    at = (120.0, 36.0)  # on the head, outside of the region
-    assert not region[36, 120]
-    assert ended(region, image, BESIDE)[36, 120]
-    assert not ended(region, image, [*BESIDE, at])[36, 120]
+def test_what_was_seen_for_sure_outweighs_colors_up_to_their_limit(rng: np.random.Generator) -> None:
+    body = walker()
+    looked = looked_at(picture(body, rng), blurred(body))
+    for limit in (0.5, 2.0):
+        odds = color_odds([looked], CONFIG.model_copy(update={"color_limit": limit}))
+        assert np.abs(odds).max() == pytest.approx(limit)
+    none = color_odds([looked], CONFIG.model_copy(update={"color_limit": 0.0}))
+    np.testing.assert_array_equal(none, 0)
+    np.testing.assert_allclose(looked.moving(none)[looked.mask], looked.evidence)
 
 
-def test_a_region_without_anything_around_it_is_returned(rng: np.random.Generator) -> None:
-    image = rng.integers(0, 255, (*SIZE, 3)).astype(np.uint8)
-    whole, nothing = np.ones(SIZE, bool), np.zeros(SIZE, bool)
-    np.testing.assert_array_equal(ended(whole, image, []), whole)
-    np.testing.assert_array_equal(ended(nothing, image, []), nothing)
+def test_without_what_moves_or_what_stands_colors_say_nothing(rng: np.random.Generator) -> None:
+    image = picture(walker(), rng)
+    for evidence in (np.full(SIZE, 3.5, np.float32), np.full(SIZE, -3.5, np.float32), np.zeros(SIZE, np.float32)):
+        everywhere = NearRegion.of(np.ones(SIZE, bool), image, evidence, REACH)
+        np.testing.assert_array_equal(color_odds([everywhere], CONFIG), 0)
+    nothing = NearRegion.of(np.zeros(SIZE, bool), image, np.zeros(SIZE, np.float32), REACH)
+    np.testing.assert_array_equal(color_odds([nothing], CONFIG), 0)
+    assert (nothing.moving(color_odds([nothing], CONFIG)) < -5).all()
 
 
-def test_what_is_background_for_sure_is_left_out_whatever_its_color(rng: np.random.Generator) -> None:
-    mask = walker()
-    image = picture(mask, rng)
-    evidence = np.ones(mask.shape, np.float32)
-    evidence[:80] = -1  # the red upper half is what a red wall shows
-    found = ended(mask, image, BESIDE, evidence)
-    assert not found[:79].any()
-    assert overlap(found[82:], mask[82:]) > 0.9
-    assert not ended(mask, image, BESIDE, -np.ones(mask.shape, np.float32)).any()
-
-
-def test_what_moves_for_sure_stays_however_thin_and_whatever_its_color(rng: np.random.Generator) -> None:
-    image = np.clip(rng.normal(120, 6, (*SIZE, 3)), 0, 255).astype(np.uint8)
-    image[40:100, 40:100] = np.clip(rng.normal((30, 40, 110), 6, (60, 60, 3)), 0, 255)  # the colors are this thing's
-    region, thin = np.zeros(SIZE, bool), np.zeros(SIZE, bool)
-    thin[60:120, 150:156] = True
-    region[40:100, 40:100] = True
-    region |= thin
-    evidence = np.ones(SIZE, np.float32)
-    unsure = ended(region, image, [], evidence)
-    assert unsure[thin].mean() < 0.2
-    evidence[thin] = CONFIG.color_sure + 0.1
-    sure = ended(region, image, [], evidence)
-    assert sure[thin].all()
-    near = cv2.dilate(region.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    assert not (sure & ~near).any()
+def test_a_few_pixels_say_little(rng: np.random.Generator) -> None:
+    evidence = np.full(SIZE, -3.0, np.float32)
+    evidence[50, 60:63] = 3.5
+    looked = NearRegion.of(np.ones(SIZE, bool), picture(walker(), rng), evidence, REACH)
+    odds = color_odds([looked], CONFIG)
+    assert odds.max() < 1.2  # one of three pixels has a color: log((1/3 + 1/3) / (1/3)), and its neighbors less

@@ -118,22 +118,19 @@ class MotionMaskConfig(Section):
     threshold: float = setting(1.0, "Log odds above which a pixel moves.", basic=True)
     interpolated_threshold: float = setting(
         0.25,
-        "The same where depth is interpolated between points of the static scene: what masks miss is then put on what "
-        "is behind it, which costs more than what they hold too much.",
+        "The same where depth is interpolated between points of the static scene, until colors have their say: what "
+        "masks miss is then put on what is behind it, which costs more than what they hold too much.",
     )
     min_area_fraction: float = setting(0.001, "Regions smaller than this part of the image are dropped.", ge=0, lt=1)
     max_static_fraction: float = setting(
         0.5, "Regions in which more than this share of the decided tracks is static are dropped.", ge=0, le=1
     )
     color_reach_px: int = setting(
-        24, "Regions end at edges of color, up to this far beyond what evidence says, working px; 0 for not.", ge=0
+        24, "Colors tell what moves in regions, and up to this far beyond what evidence says, working px.", ge=0
     )
-    color_core_px: int = setting(
-        5, "What is farther than this from the edge of a region is certain to move, working px.", ge=1
-    )
-    color_sure: float = setting(2.5, "So is what moves by more than these log odds, of 4 at most.", gt=0)
-    color_margin_px: int = setting(12, "Static colors are also looked at this far around that reach, working px.", ge=1)
-    color_track_px: int = setting(2, "Around a static track outside nothing moves up to here, working px.", ge=0)
+    color_moving: float = setting(2.75, "What evidence exceeds this, 4 at most, has colors that move ...", gt=0)
+    color_static: float = setting(-1.25, "... and what it is below this, colors that do not.", lt=0)
+    color_limit: float = setting(4.0, "Log odds that colors add or take at most; 0 for not.", ge=0)
     min_frames: int = setting(5, "Instances that move in fewer frames than this are dropped.", ge=1)
     grow_px: int = setting(2, "Masks are grown by this at the end, px.", ge=0, basic=True)
     instances: InstanceConfig = setting(InstanceConfig(join_parts=True), "How regions are joined to instances.")

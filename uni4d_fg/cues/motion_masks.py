@@ -8,8 +8,8 @@
    interpolated between points and that of the scene around (:mod:`uni4d_fg.cues.behind_moving`) take turns.
 3. A second look compares it with the background alone (:mod:`uni4d_fg.cues.background_comparison`).
    In both, the evidence of pixels and tracks is smoothed within surfaces of like color; regions above a threshold are
-   kept unless their own tracks say that they are static (:mod:`uni4d_fg.cues.moving_regions`). In the end they stop
-   where colors do (:mod:`uni4d_fg.cues.region_colors`).
+   kept unless their own tracks say that they are static (:mod:`uni4d_fg.cues.moving_regions`). In the end, colors that
+   move in the whole video add to what was seen in and around them (:mod:`uni4d_fg.cues.region_colors`).
 4. Regions are joined to instances over time (:mod:`uni4d_fg.cues.instances`); those of few frames are dropped.
 
 What stands still through the whole video is static here, whatever it is.
@@ -17,8 +17,10 @@ What stands still through the whole video is static here, whatever it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import count
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,7 +32,7 @@ from uni4d_fg.cues.depth_range import spread_at_tracks
 from uni4d_fg.cues.frame_comparison import ComparedVideo
 from uni4d_fg.cues.instances import associate_instances
 from uni4d_fg.cues.label_store import CompressedLabels
-from uni4d_fg.cues.moving_detections import first_look, second_look
+from uni4d_fg.cues.moving_detections import detections, first_look, second_look
 from uni4d_fg.cues.outlier_tracks import find_outlier_tracks
 from uni4d_fg.cues.static_cameras import StaticTracks, solve_cameras
 from uni4d_fg.cues.structure.motion import observations_of_tracks, structure_from_motion
@@ -43,6 +45,8 @@ from uni4d_fg.optim.threads import made_ahead, thread_count
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
+
+ValueT = TypeVar("ValueT")
 
 _MOST_MAY_MOVE = 0.6
 """More than this part of the image, or of the tracks, is warned of."""
@@ -100,9 +104,9 @@ def motion_masks(
         Cancelled: If ``should_stop`` turned true.
     """
     report, stop = reporter or SilentReporter(), should_stop or (lambda: False)
-    for name, count in (("depth maps", len(depths)), ("frames of tracks", tracks.num_frames)):
-        if count != video.num_frames:
-            raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
+    for name, number in (("depth maps", len(depths)), ("frames of tracks", tracks.num_frames)):
+        if number != video.num_frames:
+            raise InputError(f"motion masks: {number} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
     camera = camera or CameraModel(intrinsics)
     ideal = camera.ideal_tracks(tracks)
@@ -116,21 +120,20 @@ def motion_masks(
         video, depths, tracks, ideal, camera, known_moving, world_T_cam, config, settings, report, stop
     )
     report.end()
-    report.begin("motion masks", 2 * video.num_frames)
+    report.begin("motion masks", 3 * video.num_frames)
     given = ComparedVideo(video, depths, tracks, motion, cameras, camera, is_interpolated)
-    first = []
-    for mask in first_look(given, config, stop):
-        first.append(mask)
-        report.advance(len(first))
+    done = count(1)
+    first = _counted_off(first_look(given, config, stop), report, done)
+    second = _counted_off(second_look(given, config, first, stop), report, done)
     labels = CompressedLabels(video.image_size)
     seen_in: dict[int, int] = {}
-    found = made_ahead(second_look(given, config, first, stop), thread_count())
-    for frame, numbers in enumerate(associate_instances(found, video.images, config.instances, stop)):
+    found = made_ahead(detections(given, config, second), thread_count())
+    for numbers in associate_instances(found, video.images, config.instances, stop):
         labels.append(numbers)
         for number in np.unique(numbers[numbers > 0]).tolist():
             seen_in[number] = seen_in.get(number, 0) + 1
-        report.advance(video.num_frames + frame + 1)
-    kept = sorted(n for n, count in seen_in.items() if count >= min(config.min_frames, video.num_frames))
+        report.advance(next(done))
+    kept = sorted(n for n, frames in seen_in.items() if frames >= min(config.min_frames, video.num_frames))
     new_ids = np.zeros(max(seen_in, default=0) + 1, np.int32)
     new_ids[kept] = np.arange(1, len(kept) + 1)
     labels.rename(new_ids)
@@ -142,6 +145,15 @@ def motion_masks(
         f"{int((~motion.moving & ~motion.static).sum())} undecided"
     ]
     return MotionMasks(labels, cameras, motion, facts, _warnings(motion, area))
+
+
+def _counted_off(frames: Iterable[ValueT], report: Reporter, done: Iterator[int]) -> list[ValueT]:
+    """Return what is made of frames, each reported."""
+    made = []
+    for one in frames:
+        made.append(one)
+        report.advance(next(done))
+    return made
 
 
 def _warnings(motion: TrackMotion, area: float) -> list[str]:

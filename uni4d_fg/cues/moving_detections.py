@@ -1,4 +1,4 @@
-"""From frames that are compared to regions that move: a first look by and large, and a second for where they end."""
+"""From frames that are compared to what moves: a first look by and large, a second for where it ends, then colors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uni4d_fg.cues.evidence_over_time import LookedAt, averaged_over_time
 from uni4d_fg.cues.frame_comparison import ComparedVideo
 from uni4d_fg.cues.moving_regions import grown, moving_region, smoothed_evidence, trusted_components
 from uni4d_fg.cues.neighbor_comparison import NeighborComparison
-from uni4d_fg.cues.region_colors import end_at_colors
+from uni4d_fg.cues.region_colors import NearRegion, color_odds
 from uni4d_fg.frontend.sequence.bars import only_content
 
 PackedMask = npt.NDArray[np.uint8]
@@ -41,8 +41,8 @@ def first_look(
 
 def second_look(
     given: ComparedVideo, config: MotionMaskConfig, first: list[PackedMask], stop: Callable[[], bool]
-) -> Generator[FrameDetections, None, None]:
-    """Yield the regions that move, frame by frame, from what the first look found in the T frames.
+) -> Generator[NearRegion, None, None]:
+    """Yield the regions that move, and what is around them, frame by frame, from what the first look found in T frames.
 
     Raises:
         Cancelled: If ``stop`` turned true.
@@ -51,9 +51,17 @@ def second_look(
     looked = averaged_over_time(_looked_at(comparison, config.background_smoothing_px, stop), config)
     for frame, (image, evidence, _) in enumerate(looked):
         region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
-        region = end_at_colors(region, image, evidence, given.tracks, given.motion, frame, comparison.scale, config)
-        region = _between_bars(region, given)
-        masks = grown(_trusted(region, frame, given, config), config.grow_px)
+        yield NearRegion.of(region, image, evidence, config.color_reach_px)
+
+
+def detections(
+    given: ComparedVideo, config: MotionMaskConfig, second: list[NearRegion]
+) -> Generator[FrameDetections, None, None]:
+    """Yield what moves, frame by frame: where the second look found regions, by what was seen and by color."""
+    odds = color_odds(second, config)
+    for frame, looked in enumerate(second):
+        moves = moving_region(looked.moving(odds), given.video.image_size, config.threshold, config)
+        masks = grown(_trusted(_between_bars(moves, given), frame, given, config), config.grow_px)
         yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
 
 

@@ -1,87 +1,134 @@
-"""Regions that move, made to end where colors do.
+"""What colors say of what moves, learned from the whole video.
 
-What appearance and tracks say of a pixel is blurred, and silent where the image is flat: heads and legs are missed, and
-strips of background beside a thing are taken along. Inside a region and around it the colors of both tell which pixel
-belongs to which, and edges of the image where they part: GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004), as
-OpenCV has it. Certain to move are the core of a region and what evidence is sure of; what is thin and was hardly seen
-to move has to be told by its colors, or goes.
+What evidence says of a pixel is blurred, and silent where the image is flat or a thing stands for a moment: heads and
+legs are missed, and strips of the background beside a thing are taken along. But what is missed in one frame is seen
+to move in others, and has the same color there. Near the regions that move, by and large, two histograms of color are
+counted over all frames: of the pixels that move for sure, and of those that stand still for sure. The log of the ratio
+of both is one more evidence, with which they are counted a second time: what evidence took for the wrong side of an
+edge is mostly put right by then.
+
+Histograms of color as a model of what moves and of what does not are those of Boykov and Jolly (ICCV 2001); that they
+are counted again with what they say is hard expectation maximization.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter
 
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
-from uni4d_fg.cues.moving_regions import disk, working_pixels
-from uni4d_fg.cues.track_motion import TrackMotion
-from uni4d_fg.frontend.track_model import Tracks
+from uni4d_fg.cues.moving_regions import disk
 
-_BLUR_PX = 2
-"""Regions end before what moves does by about this, image px, as evidence is blurred."""
-_SEED = 0
-"""OpenCV draws the first means of the color models: from the same state in every frame."""
+_BINS = 32
+"""Of lightness and of both axes of color (CIE L*a*b*)."""
+_COLORFUL = 80
+"""Most of a* and b*: what is more colorful has the last bin."""
+_SMOOTHED = 0.5
+"""Standard deviation of the Gaussian over the histograms, bins."""
+_RARE = 2e-5
+"""Added to both shares of a color: one that either has less of says nothing. Of few pixels one more is added, so that
+the color of a single one doubles its odds at most."""
+_ROUNDS = 2
+_BLUR_PX = 1.0
+"""Standard deviation of the Gaussian over what colors say, working px: that of the compression and of mixed pixels."""
+_STEPS = 24
+"""Evidence is held in steps of one over this, log odds: within the range of a signed byte."""
 
 
-def end_at_colors(
-    region: BoolArray,
-    image: ImageArray,
-    evidence: Float32Array,
-    tracks: Tracks,
-    motion: TrackMotion,
-    frame: int,
-    scale: FloatArray,
-    config: MotionMaskConfig,
-) -> BoolArray:
-    """Return a region (H, W) that ends at edges of color near those of the given one.
+@dataclass(frozen=True)
+class NearRegion:
+    """What a frame shows in and around its regions: little enough that it is held of all frames."""
+
+    size: tuple[int, int]
+    """(h, w) working px."""
+    near: npt.NDArray[np.uint8]
+    """Which pixels that is, packed by :func:`numpy.packbits`."""
+    color: npt.NDArray[np.uint16]
+    """(N,) bins of their colors ..."""
+    held: npt.NDArray[np.int8]
+    """... and the log odds that they move."""
+
+    @classmethod
+    def of(cls, region: BoolArray, image: ImageArray, evidence: Float32Array, reach_px: int) -> NearRegion:
+        """Keep what is not farther than ``reach_px`` (working px) from a region.
+
+        Args:
+            region: (H, W) True where something moves, by and large.
+            image: (h, w, 3) uint8 RGB at working size.
+            evidence: (h, w) log odds that pixels move.
+            reach_px: How far.
+        """
+        size = evidence.shape[:2]
+        small = cv2.resize(region.astype(np.uint8), size[::-1], interpolation=cv2.INTER_AREA)
+        near = cv2.dilate(small, disk(reach_px)) > 0
+        held = np.clip(np.rint(evidence[near] * _STEPS), -127, 127).astype(np.int8)
+        return cls(size, np.packbits(near), _bins(image)[near], held)
+
+    @property
+    def mask(self) -> BoolArray:
+        """Return which pixels (h, w) are near."""
+        return np.unpackbits(self.near, count=self.size[0] * self.size[1]).reshape(self.size) > 0
+
+    @property
+    def evidence(self) -> Float32Array:
+        """Return the log odds (N,) that the pixels near move, by what was seen of them."""
+        return np.multiply(self.held, np.float32(1 / _STEPS), dtype=np.float32)
+
+    def colored(self, odds: Float32Array) -> tuple[BoolArray, Float32Array]:
+        """Return which pixels (h, w) are near, and the log odds (N,) that they move by what was seen and by color."""
+        mask, said = self.mask, np.zeros(self.size, np.float32)
+        said[mask] = odds[self.color]
+        return mask, self.evidence + cv2.GaussianBlur(said, (0, 0), _BLUR_PX)[mask]
+
+    def moving(self, odds: Float32Array) -> Float32Array:
+        """Return the log odds (h, w) that pixels move; those that are not near do not."""
+        mask, evidence = self.colored(odds)
+        out = np.full(self.size, np.float32(-127 / _STEPS))
+        out[mask] = evidence
+        return out
+
+
+def color_odds(frames: Sequence[NearRegion], config: MotionMaskConfig) -> Float32Array:
+    """Return the log odds that a color moves, by its bin; 0 where too little is known.
 
     Args:
-        region: (H, W) True where something moves, by and large.
-        image: (h, w, 3) uint8 RGB at working size.
-        evidence: (h, w) log odds that pixels move. Below 0 they do not, and above ``config.color_sure`` within the
-            region they do, whatever the color.
-        tracks: K tracks; around static ones outside the region nothing moves.
-        motion: Which of them move.
-        frame: The frame.
-        scale: (2,) working pixels per image pixel, x and y.
-        config: Its fields ``color_...``, in working pixels.
+        frames: Of the whole video.
+        config: Its fields ``color_...``.
     """
-    size = image.shape[:2]
-    wide = cv2.dilate(region.astype(np.uint8), disk(_BLUR_PX))
-    small = cv2.resize(wide, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
-    if not small.any() or config.color_reach_px == 0:
-        return region
-    near = cv2.dilate(small, disk(config.color_reach_px))
-    label = np.full(size, cv2.GC_BGD, np.uint8)
-    label[near > 0] = cv2.GC_PR_BGD
-    label[small > 0] = cv2.GC_PR_FGD
-    core = cv2.erode(small, disk(config.color_core_px)) > 0
-    label[core | ((small > 0) & (evidence > config.color_sure))] = cv2.GC_FGD
-    at_rest = np.zeros(size, np.uint8)
-    at_rest[working_pixels(tracks.uv[motion.static & tracks.visible[:, frame], frame], size, scale)] = 1
-    label[(cv2.dilate(at_rest, disk(config.color_track_px)) > 0) & (small == 0)] = cv2.GC_BGD
-    label[evidence < 0] = cv2.GC_BGD
-    part = _around_region(near, config.color_margin_px)
-    inside = label[part].copy()
-    if _moves(inside).all():  # no other color to tell them from
-        return region
-    if not _moves(inside).any():
-        return np.zeros_like(region)
-    cv2.setRNGSeed(_SEED)
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(image[part]), inside, None, *models, 1, cv2.GC_INIT_WITH_MASK)
-    found = np.zeros(size, np.float32)
-    found[part] = _moves(inside)
-    full = cv2.resize(found, (region.shape[1], region.shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full > 0.5)
+    odds = np.zeros(_BINS**3, np.float32)
+    for turn in range(_ROUNDS):
+        moving, static = np.zeros(_BINS**3), np.zeros(_BINS**3)
+        for frame in frames:
+            evidence = frame.evidence if turn == 0 else frame.colored(odds)[1]
+            moving += np.bincount(frame.color[evidence > config.color_moving], minlength=_BINS**3)
+            static += np.bincount(frame.color[evidence < config.color_static], minlength=_BINS**3)
+        fewest = min(moving.sum(), static.sum())
+        if fewest == 0:
+            break
+        rare = _RARE + 1.0 / fewest
+        ratio = np.log((_shares(moving) + rare) / (_shares(static) + rare))
+        odds = np.clip(ratio, -config.color_limit, config.color_limit).astype(np.float32)
+    return odds
 
 
-def _moves(label: np.ndarray) -> BoolArray:
-    return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
+def _bins(image: ImageArray) -> npt.NDArray[np.uint16]:
+    """Return the bin (h, w) of each color of an image (h, w, 3) uint8 RGB."""
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+    of_value = np.arange(256)
+    lightness = (of_value * _BINS // 256).astype(np.uint16)
+    # OpenCV has a* and b* of bytes shifted by 128.
+    color = np.clip((of_value - 128 + _COLORFUL) * _BINS // (2 * _COLORFUL), 0, _BINS - 1).astype(np.uint16)
+    bins: npt.NDArray[np.uint16] = (lightness[lab[..., 0]] * _BINS + color[lab[..., 1]]) * _BINS + color[lab[..., 2]]
+    return bins
 
 
-def _around_region(near: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a region and a margin around it."""
-    rows, columns = (np.flatnonzero(near.any(axis=axis)) for axis in (1, 0))
-    return tuple(slice(max(0, int(k[0]) - margin), int(k[-1]) + 1 + margin) for k in (rows, columns))  # type: ignore[return-value]
+def _shares(count: FloatArray) -> FloatArray:
+    """Return which part of all pixels has each color, smoothed over those alike."""
+    smooth = gaussian_filter(count.reshape((_BINS,) * 3), _SMOOTHED).reshape(-1)
+    return np.asarray(smooth / smooth.sum())
