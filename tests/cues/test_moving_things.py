@@ -131,6 +131,19 @@ def test_the_apparent_size_follows_a_thing_that_comes_near() -> None:
     assert found.inverse_depth == pytest.approx(1 / at_one.mean(), rel=0.1)
 
 
+def test_what_turns_about_its_height_changes_its_size_half_as_much(rng: np.random.Generator) -> None:
+    # A thing half a meter deep and 0.1 m wide turns by 80 degrees at 2.5 m, and is as tall as before.
+    inside = rng.uniform((-0.05, -0.3, -0.25), (0.05, 0.3, 0.25), size=(200, 3))
+    angle = np.radians(np.linspace(0, 80, FRAMES))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    x = inside[:, :1] * cosine + inside[:, 2:] * sine
+    z = 2.5 - inside[:, :1] * sine + inside[:, 2:] * cosine
+    uv = np.stack((FOCAL * x / z + 160, FOCAL * inside[:, 1:2] / z + 120), axis=2)
+    (found,) = moving_parallax(uv, np.ones(uv.shape[:2], bool), poses(np.zeros((FRAMES, 3))), INTRINSICS, EXACT)
+    # Distances in all directions say 0.35, those along its height nothing.
+    assert np.ptp(np.log(found.size)) < 0.2
+
+
 @pytest.mark.parametrize(
     ("ratio", "sigma", "cut", "stands", "factor", "contradicts"),
     [

@@ -52,6 +52,8 @@ _MIN_PAIRS = 20
 _DRAWS = 3
 """Of so many tracks the one that is nearest to another is paired with it: where a mask holds two things, pairs are
 within either of them."""
+_UPRIGHT = 0.5
+"""Distances along columns are those of tracks that are at most twice as far apart across."""
 _SIZE_WINDOW = 5
 """Frames over which the logarithm of the size is averaged."""
 _OUTLIER = 3.0
@@ -101,20 +103,21 @@ def moving_parallax(
 
 
 def _apparent_size(uv: FloatArray, visible: BoolArray) -> FloatArray:
-    """Return how large a thing appears, (T,), from how the distances between its tracks change."""
+    """Return how large a thing appears, (T,), from how the distances between its tracks change.
+
+    Half of it is what distances along the image's columns say: what turns about its height is foreshortened across.
+    """
     rng = np.random.default_rng(0)
     steps = np.zeros(uv.shape[1] - 1)
     for frame in range(len(steps)):
         both = np.flatnonzero(visible[:, frame] & visible[:, frame + 1])
         a, others = rng.choice(both, _PAIRS), rng.choice(both, (_DRAWS, _PAIRS))
-        distance = np.linalg.norm(uv[a, frame] - uv[others, frame], axis=2)
-        distance[distance <= _MIN_DISTANCE_PX] = np.inf
-        nearest = distance.argmin(axis=0)
-        b, before = others[nearest, np.arange(_PAIRS)], distance.min(axis=0)
-        after = np.linalg.norm(uv[a, frame + 1] - uv[b, frame + 1], axis=1)
-        good = np.isfinite(before) & (after > 0)
-        if np.count_nonzero(good) >= _MIN_PAIRS:
-            steps[frame] = np.median(np.log(after[good] / before[good]))
+        before, after = (np.abs(uv[others, t] - uv[a, t]) for t in (frame, frame + 1))
+        across, along = np.moveaxis(before, -1, 0)
+        steps[frame] = 0.5 * (
+            _growth(np.hypot(across, along), np.hypot(*np.moveaxis(after, -1, 0)))
+            + _growth(np.where(along > _UPRIGHT * across, along, 0.0), after[..., 1])
+        )
     log_size = np.concatenate(([0.0], np.cumsum(steps)))
     half = min(_SIZE_WINDOW, len(log_size)) // 2
     # Windows are cut alike on both sides at the ends, where one-sided means would flatten a trend.
@@ -122,6 +125,17 @@ def _apparent_size(uv: FloatArray, visible: BoolArray) -> FloatArray:
         [log_size[t - w : t + w + 1].mean() for t in range(len(log_size)) for w in (min(half, t, len(steps) - t),)]
     )
     return np.asarray(np.exp(smooth - smooth.mean()))
+
+
+def _growth(before: FloatArray, after: FloatArray) -> float:
+    """Return the median log ratio of the shortest of some distances (draws, N) that is long enough; 0 of too few."""
+    far = np.where(before > _MIN_DISTANCE_PX, before, np.inf)
+    nearest = far.argmin(axis=0), np.arange(far.shape[1])
+    before, after = far[nearest], after[nearest]
+    good = np.isfinite(before) & (after > 0)
+    if np.count_nonzero(good) < _MIN_PAIRS:
+        return 0.0
+    return float(np.median(np.log(after[good] / before[good])))
 
 
 def _over_parts(rays: FloatArray, visible: BoolArray, centers: FloatArray, noise: CameraNoise) -> tuple[float, float]:

@@ -5,7 +5,8 @@ Most things stand there. Those that do not (they fly, they are carried, or the i
 factor that only the camera's own motion may show (``moving_parallax.py``). Both are weighed by what it shows:
 
 - standing: ``log rho ~ N(0, 0.15^2)``, where ``rho`` is the inverse depth over that of the surface below. Where tracks
-  show how the thing's apparent size changes, that of the frames in which it seems nearest is followed to the others;
+  show how the thing's apparent size changes, the frames in which it seems nearest say most of the others
+  (``standing_over_time.py``);
 - nearer: ``log rho`` exponential, 0.7 in the mean, and at most ``log 8``.
 """
 
@@ -21,6 +22,7 @@ from uni4d_fg.arrays import BoolArray, FloatArray, Int32Array, IntArray, at_near
 from uni4d_fg.cues.camera_noise import CameraNoise
 from uni4d_fg.cues.interpolated_depth import NEAREST_SHARE
 from uni4d_fg.cues.moving_parallax import Parallax, moving_parallax
+from uni4d_fg.cues.standing_over_time import standing_over_time
 from uni4d_fg.frontend.track_model import Tracks
 
 _STANDING_SIGMA = 0.15
@@ -151,8 +153,12 @@ def place_moving(
             tells = not weighed.contradicts and parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
             shown |= tells
             cut_frames, all_frames = cut_frames + cut * len(frames), all_frames + len(frames)
-            for frame, here in zip(frames, size.tolist(), strict=True):
-                placed[frame][label] = np.exp(weighed.log_ratio) * standing * here
+            at_size = np.full(len(frames), standing)
+            if weighed.stands and not cut:
+                is_bound = np.array([frame in sightings.cut_in[label] for frame in frames])
+                at_size = np.exp(standing_over_time(np.log(at_size_one), is_bound))
+            for frame, inverse in zip(frames, (at_size * size).tolist(), strict=True):
+                placed[frame][label] = np.exp(weighed.log_ratio) * inverse
             if tells and not weighed.stands:
                 nearer.setdefault(label, []).append(float(np.exp(weighed.log_ratio)))
         is_cut = 2 * cut_frames > all_frames if all_frames else sightings.is_cut(label)
