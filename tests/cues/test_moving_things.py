@@ -244,6 +244,23 @@ def test_what_is_seen_whole_in_some_frames_stands_where_it_does_there(
         assert np.median(ratio) == pytest.approx(at_border * np.exp(weigh(0.0, np.inf, True).log_ratio), rel=0.03)
 
 
+@pytest.mark.parametrize(("width", "factor"), [(0, 1.0), (100, np.exp(0.2))])
+def test_what_walks_with_its_legs_cut_off_is_a_little_nearer(width: int, factor: float) -> None:
+    centers = camera(0.0)
+    tracks = seen(thing(), centers, 0.1)
+    found = Sightings(tracks)
+    mask = np.zeros(SIZE, dtype=np.int32)
+    mask[:200] = 3
+    mask[200:, :width] = 3
+    for frame in range(FRAMES):
+        found.add(frame, mask)
+    contacts = tuple({3: 0.2} for _ in range(FRAMES))
+    placed = place_moving(contacts, found, tracks, poses(centers), INTRINSICS, EXACT)
+    np.testing.assert_allclose([values[3] for values in placed.inverse_depth], 0.2 * factor, rtol=0.03)
+    assert not placed.nearer
+    assert not placed.open
+
+
 def test_things_without_tracks_and_frames_without_things_are_left_alone() -> None:
     nothing = Tracks(np.zeros((0, 3, 2), np.float32), np.zeros((0, 3), dtype=bool), np.zeros(0, dtype=np.int32))
     found = Sightings(nothing)
