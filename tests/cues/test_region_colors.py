@@ -12,6 +12,7 @@ from uni4d_fg.cues.region_colors import NearRegion, color_odds
 SIZE = (180, 240)
 CONFIG = MotionMaskConfig()
 REACH = CONFIG.color_reach_px
+EVERYWHERE = np.ones(SIZE, bool)
 
 
 def walker(left: int = 0, legs: bool = True) -> np.ndarray:
@@ -43,7 +44,7 @@ def blurred(mask: np.ndarray) -> np.ndarray:
 
 def looked_at(image: np.ndarray, evidence: np.ndarray, reach_px: int = REACH, larger: int = 1) -> NearRegion:
     region = cv2.resize((evidence > 0.25).astype(np.uint8), None, fx=larger, fy=larger, interpolation=cv2.INTER_NEAREST)
-    return NearRegion.of(region > 0, image, evidence, reach_px)
+    return NearRegion.of(region > 0, image, evidence, reach_px, EVERYWHERE)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
@@ -110,9 +111,9 @@ def test_what_was_seen_for_sure_outweighs_colors_up_to_their_limit(rng: np.rando
 def test_without_what_moves_or_what_stands_colors_say_nothing(rng: np.random.Generator) -> None:
     image = picture(walker(), rng)
     for evidence in (np.full(SIZE, 3.5, np.float32), np.full(SIZE, -3.5, np.float32), np.zeros(SIZE, np.float32)):
-        everywhere = NearRegion.of(np.ones(SIZE, bool), image, evidence, REACH)
+        everywhere = NearRegion.of(EVERYWHERE, image, evidence, REACH, EVERYWHERE)
         np.testing.assert_array_equal(color_odds([everywhere], CONFIG), 0)
-    nothing = NearRegion.of(np.zeros(SIZE, bool), image, np.zeros(SIZE, np.float32), REACH)
+    nothing = NearRegion.of(np.zeros(SIZE, bool), image, np.zeros(SIZE, np.float32), REACH, EVERYWHERE)
     np.testing.assert_array_equal(color_odds([nothing], CONFIG), 0)
     assert (nothing.moving(color_odds([nothing], CONFIG)) < -5).all()
 
@@ -120,6 +121,19 @@ def test_without_what_moves_or_what_stands_colors_say_nothing(rng: np.random.Gen
 def test_a_few_pixels_say_little(rng: np.random.Generator) -> None:
     evidence = np.full(SIZE, -3.0, np.float32)
     evidence[50, 60:63] = 3.5
-    looked = NearRegion.of(np.ones(SIZE, bool), picture(walker(), rng), evidence, REACH)
+    looked = NearRegion.of(EVERYWHERE, picture(walker(), rng), evidence, REACH, EVERYWHERE)
     odds = color_odds([looked], CONFIG)
     assert odds.max() < 1.2  # one of three pixels has a color: log((1/3 + 1/3) / (1/3)), and its neighbors less
+
+
+def test_black_bars_have_no_color(rng: np.random.Generator) -> None:
+    body = walker()
+    image, evidence = picture(body, rng), blurred(body)
+    image[:20], evidence[:20] = 0, 3.9  # bars seem to move where the scene does
+    pictured = np.arange(SIZE[0])[:, None] * np.ones(SIZE) >= 20
+    with_bars = NearRegion.of(evidence > 0.25, image, evidence, REACH, EVERYWHERE)
+    looked = NearRegion.of(evidence > 0.25, image, evidence, REACH, pictured)
+    black = 16 * 32 + 16  # the middle of both axes of color, and no lightness
+    assert color_odds([with_bars], CONFIG)[black] > 2
+    assert color_odds([looked], CONFIG)[black] == pytest.approx(0, abs=0.1)
+    assert not (looked.moving(color_odds([looked], CONFIG))[:20] > -5).any()

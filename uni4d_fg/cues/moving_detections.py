@@ -48,10 +48,12 @@ def second_look(
         Cancelled: If ``stop`` turned true.
     """
     comparison = BackgroundComparison(given, config, first)
+    pictured = _between_bars(np.ones(given.video.image_size, bool), given)
+    pictured = cv2.resize(pictured.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST) > 0
     looked = averaged_over_time(_looked_at(comparison, config.background_smoothing_px, stop), config)
     for frame, (image, evidence, _) in enumerate(looked):
         region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
-        yield NearRegion.of(region, image, evidence, config.color_reach_px)
+        yield NearRegion.of(region, image, evidence, config.color_reach_px, pictured)
 
 
 def detections(

@@ -55,7 +55,9 @@ class NearRegion:
     """... and the log odds that they move."""
 
     @classmethod
-    def of(cls, region: BoolArray, image: ImageArray, evidence: Float32Array, reach_px: int) -> NearRegion:
+    def of(
+        cls, region: BoolArray, image: ImageArray, evidence: Float32Array, reach_px: int, pictured: BoolArray
+    ) -> NearRegion:
         """Keep what is not farther than ``reach_px`` (working px) from a region.
 
         Args:
@@ -63,10 +65,11 @@ class NearRegion:
             image: (h, w, 3) uint8 RGB at working size.
             evidence: (h, w) log odds that pixels move.
             reach_px: How far.
+            pictured: (h, w) what is no black bar.
         """
         size = evidence.shape[:2]
         small = cv2.resize(region.astype(np.uint8), size[::-1], interpolation=cv2.INTER_AREA)
-        near = cv2.dilate(small, disk(reach_px)) > 0
+        near = (cv2.dilate(small, disk(reach_px)) > 0) & pictured
         held = np.clip(np.rint(evidence[near] * _STEPS), -127, 127).astype(np.int8)
         return cls(size, np.packbits(near), _bins(image)[near], held)
 
