@@ -103,6 +103,11 @@ class CameraConfig(Section):
     )
 
     @property
+    def to_the_end(self) -> dict[str, float]:
+        """Return the settings of a solver that fits a lens or a zoom until it stays."""
+        return {"relative_decrease": self.relative_decrease, "max_iterations": self.max_iterations}
+
+    @property
     def reads_at_once(self) -> bool:
         """Whether all rows are known to be read at the same time."""
         return self.rolling_shutter in ("off", 0.0)

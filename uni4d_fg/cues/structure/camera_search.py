@@ -180,9 +180,7 @@ def _refined(plain: Fitted, judge: TrackJudge, config: Config) -> Fitted:
 
 def _to_its_end(lens: Fitted, config: Config) -> Fitted:
     """Fit a lens that was taken until it stays: compared with others it was before."""
-    settings = config.camera
-    options = {"relative_decrease": settings.relative_decrease, "max_iterations": settings.max_iterations}
-    return fit_lens(lens, lens.camera.lens.model, config, options)
+    return fit_lens(lens, lens.camera.lens.model, config, config.camera.to_the_end)
 
 
 def _grown_with(

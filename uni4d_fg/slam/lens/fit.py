@@ -163,15 +163,11 @@ class LensFit:
         self, scene: StaticScene, lens: Lens, model: LensModel, options: Mapping[str, float] | None = None
     ) -> FittedLens:
         """Solve with the parameters held, and then free: what the second gains is the evidence for them."""
-        camera_config, ba = self.config.camera, self.config.bundle_adjustment
+        ba = self.config.bundle_adjustment
         variable, _, _ = lens_family(model)
         probe = "" if options is None else " probe"
         problem, state = self._problem(scene, lens, model)
-        until_the_end = {
-            "relative_decrease": camera_config.relative_decrease,
-            "max_iterations": camera_config.max_iterations,
-        }
-        solver = ba.solver.model_copy(update=dict(options or until_the_end))
+        solver = ba.solver.model_copy(update=dict(options or self.config.camera.to_the_end))
         pixel = [] if ba.free_principal_point else [2, 3]
         held = Stage("lens", replace(problem).fix(variable, entries=[*pixel, 4, 5, 6, 7]), solver, part=f"held{probe}")
         state, before = self.run(held, state, self.hooks)

@@ -91,10 +91,9 @@ class ZoomFit:
             SolverError: If a system is singular.
             Cancelled: If the user interrupts.
         """
-        camera, ba = self.fit.config.camera, self.fit.config.bundle_adjustment
+        ba = self.fit.config.bundle_adjustment
         problem, state = self._problem(scene)
-        to_the_end = {"relative_decrease": camera.relative_decrease, "max_iterations": camera.max_iterations}
-        solver = ba.solver.model_copy(update=dict(options or to_the_end))
+        solver = ba.solver.model_copy(update=dict(options or self.fit.config.camera.to_the_end))
         before = problem.energies(state)["static_reprojection"]
         stage = Stage("lens", problem, solver, part=part)
         state, after = self.fit.run(stage, state, self.fit.hooks)
