@@ -45,8 +45,8 @@ _CUT_WIDTH = 0.4
 """A thing is cut off where its mask is wider than this at the image's lower border, as a part of its widest row: what
 reaches down to it and is narrower is a leg, a foot or a shadow ..."""
 _LEG = 0.2
-"""... and if it does so whenever it seems nearest, what is missing of it makes it nearer by this log factor: 0.3, 0.2
-and 0.1 of three people who walk; a camera at the height of eyes sees 0.3 of one whose knee is at the border."""
+"""... and if it does so in most frames, what is missing of it makes it nearer by this log factor: 0.3 and 0.1 of two
+people who walk; a camera at the height of eyes sees 0.3 of one whose knee is at the border."""
 
 
 @dataclass
@@ -157,18 +157,17 @@ def place_moving(
             # Seen whole in some frames, a thing stands where it does there: in others it goes on below the image,
             # nearer than what is at the border, and where its feet were missed it seems farther.
             nearest = set(np.array(frames)[at_size_one >= standing].tolist())
-            cut, reaches = (
-                2 * len(nearest & of_label[label]) > len(nearest)
-                for of_label in (sightings.cut_in, sightings.reaches_in)
+            cut = _mostly_in(nearest, sightings.cut_in[label])
+            legs_cut = not cut and _mostly_in(set(frames), sightings.reaches_in[label])
+            weighed = weigh(
+                parallax.inverse_depth / standing, parallax.sigma / standing, cut, _LEG if legs_cut else 0.0
             )
-            legs = _LEG if reaches and not cut else 0.0
-            weighed = weigh(parallax.inverse_depth / standing, parallax.sigma / standing, cut, legs)
             tells = not weighed.contradicts and parallax.sigma < _ON_IT * abs(parallax.inverse_depth)
             shown |= tells
             cut_frames, all_frames = cut_frames + cut * len(frames), all_frames + len(frames)
             at_size = np.full(len(frames), standing)
-            if weighed.stands and not reaches:
-                is_bound = np.array([frame in sightings.reaches_in[label] for frame in frames])
+            if weighed.stands and not cut and not legs_cut:
+                is_bound = np.array([frame in sightings.cut_in[label] for frame in frames])
                 at_size = np.exp(standing_over_time(np.log(at_size_one), is_bound))
             for frame, inverse in zip(frames, (at_size * size).tolist(), strict=True):
                 placed[frame][label] = np.exp(weighed.log_ratio) * inverse
@@ -178,6 +177,10 @@ def place_moving(
         if is_cut and not shown:
             unknown.append(label)
     return Placed(tuple(placed), {label: float(np.median(ratios)) for label, ratios in nearer.items()}, unknown)
+
+
+def _mostly_in(frames: set[int], those: set[int]) -> bool:
+    return len(frames & those) > _MOSTLY * len(frames)
 
 
 class Weighed(NamedTuple):
