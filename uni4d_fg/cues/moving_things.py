@@ -45,8 +45,8 @@ _CUT_WIDTH = 0.4
 """A thing is cut off where its mask is wider than this at the image's lower border, as a part of its widest row: what
 reaches down to it and is narrower is a leg, a foot or a shadow ..."""
 _LEG = 0.2
-"""... and if it does so in most frames, what is missing of it makes it nearer by this log factor: 0.3 and 0.1 of two
-people who walk; a camera at the height of eyes sees 0.3 of one whose knee is at the border."""
+"""... and if it does so in most frames, and of those in which it seems nearest, what is missing of it makes it nearer by
+this log factor: 0.3 of somebody who is followed; a camera at the height of eyes sees 0.3 of one whose knee is at the border."""
 
 
 @dataclass
@@ -158,7 +158,8 @@ def place_moving(
             # nearer than what is at the border, and where its feet were missed it seems farther.
             nearest = set(np.array(frames)[at_size_one >= standing].tolist())
             cut = _mostly_in(nearest, sightings.cut_in[label])
-            legs_cut = not cut and _mostly_in(set(frames), sightings.reaches_in[label])
+            reaches = sightings.reaches_in[label]
+            legs_cut = not cut and _mostly_in(nearest, reaches) and _mostly_in(set(frames), reaches)
             weighed = weigh(
                 parallax.inverse_depth / standing, parallax.sigma / standing, cut, _LEG if legs_cut else 0.0
             )
