@@ -45,8 +45,9 @@ _CUT_WIDTH = 0.4
 """A thing is cut off where its mask is wider than this at the image's lower border, as a part of its widest row: what
 reaches down to it and is narrower is a leg, a foot or a shadow ..."""
 _LEG = 0.2
-"""... and if it does so in most frames, and of those in which it seems nearest, what is missing of it makes it nearer by
-this log factor: 0.3 of somebody who is followed; a camera at the height of eyes sees 0.3 of one whose knee is at the border."""
+"""... and if it does so in most frames, and in most of those in which it seems nearest, what is missing of it makes it
+nearer by this log factor: 0.3 of somebody who is followed; a camera at the height of eyes sees 0.3 of one whose knee is
+at the border."""
 
 
 @dataclass
