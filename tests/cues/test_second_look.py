@@ -7,7 +7,7 @@ import numpy as np
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.background_comparison import BackgroundComparison
 from uni4d_fg.cues.frame_comparison import ComparedVideo
-from uni4d_fg.cues.moving_detections import first_look, second_look
+from uni4d_fg.cues.moving_detections import detections, first_look, second_look
 from uni4d_fg.cues.neighbor_comparison import NeighborComparison
 from uni4d_fg.cues.track_motion import TrackMotion
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
@@ -67,7 +67,8 @@ def test_a_plain_thing_differs_from_the_background_where_it_looks_as_if_it_stood
     # Flat as it is, the wall is seen to be what it is elsewhere in time; its neighbors could not tell.
     assert abs(of_neighbors[beside].mean()) < 0.3
     assert of_background[beside].mean() < -2
-    found = [detections.masks.any(axis=0) for detections in second_look(given, CONFIG, first, never)]
+    second = list(second_look(given, CONFIG, first, never))
+    found = [moving.masks.any(axis=0) for moving in detections(given, CONFIG, second)]
     overlaps = [(a & b).sum() / (a | b).sum() for a, b in zip(found, masks, strict=True)]
     assert np.mean(overlaps) > 0.9
     assert min(overlaps) > 0.75
