@@ -17,9 +17,8 @@ What stands still through the whole video is static here, whatever it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from itertools import count
 from typing import TypeVar
 
 import numpy as np
@@ -104,9 +103,9 @@ def motion_masks(
         Cancelled: If ``should_stop`` turned true.
     """
     report, stop = reporter or SilentReporter(), should_stop or (lambda: False)
-    for name, number in (("depth maps", len(depths)), ("frames of tracks", tracks.num_frames)):
-        if number != video.num_frames:
-            raise InputError(f"motion masks: {number} {name}, but {video.num_frames} images; make them of one video")
+    for name, count in (("depth maps", len(depths)), ("frames of tracks", tracks.num_frames)):
+        if count != video.num_frames:
+            raise InputError(f"motion masks: {count} {name}, but {video.num_frames} images; make them of one video")
     settings = solver or Config()
     camera = camera or CameraModel(intrinsics)
     ideal = camera.ideal_tracks(tracks)
@@ -122,18 +121,17 @@ def motion_masks(
     report.end()
     report.begin("motion masks", 3 * video.num_frames)
     given = ComparedVideo(video, depths, tracks, motion, cameras, camera, is_interpolated)
-    done = count(1)
-    first = _counted_off(first_look(given, config, stop), report, done)
-    second = _counted_off(second_look(given, config, first, stop), report, done)
+    first = _reported(first_look(given, config, stop), report, 0)
+    second = _reported(second_look(given, config, first, stop), report, len(first))
     labels = CompressedLabels(video.image_size)
     seen_in: dict[int, int] = {}
     found = made_ahead(detections(given, config, second), thread_count())
-    for numbers in associate_instances(found, video.images, config.instances, stop):
+    for frame, numbers in enumerate(associate_instances(found, video.images, config.instances, stop)):
         labels.append(numbers)
         for number in np.unique(numbers[numbers > 0]).tolist():
             seen_in[number] = seen_in.get(number, 0) + 1
-        report.advance(next(done))
-    kept = sorted(n for n, frames in seen_in.items() if frames >= min(config.min_frames, video.num_frames))
+        report.advance(len(first) + len(second) + frame + 1)
+    kept = sorted(n for n, count in seen_in.items() if count >= min(config.min_frames, video.num_frames))
     new_ids = np.zeros(max(seen_in, default=0) + 1, np.int32)
     new_ids[kept] = np.arange(1, len(kept) + 1)
     labels.rename(new_ids)
@@ -147,12 +145,12 @@ def motion_masks(
     return MotionMasks(labels, cameras, motion, facts, _warnings(motion, area))
 
 
-def _counted_off(frames: Iterable[ValueT], report: Reporter, done: Iterator[int]) -> list[ValueT]:
-    """Return what is made of frames, each reported."""
+def _reported(frames: Iterable[ValueT], report: Reporter, before: int) -> list[ValueT]:
+    """Return what is made of frames, each reported as one more than what was done before."""
     made = []
     for one in frames:
         made.append(one)
-        report.advance(next(done))
+        report.advance(before + len(made))
     return made
 
 

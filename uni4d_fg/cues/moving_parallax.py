@@ -113,10 +113,10 @@ def _apparent_size(uv: FloatArray, visible: BoolArray) -> FloatArray:
         both = np.flatnonzero(visible[:, frame] & visible[:, frame + 1])
         a, others = rng.choice(both, _PAIRS), rng.choice(both, (_DRAWS, _PAIRS))
         before, after = (np.abs(uv[others, t] - uv[a, t]) for t in (frame, frame + 1))
-        across, along = np.moveaxis(before, -1, 0)
+        upright = before[..., 1] > _UPRIGHT * before[..., 0]
         steps[frame] = 0.5 * (
-            _growth(np.hypot(across, along), np.hypot(*np.moveaxis(after, -1, 0)))
-            + _growth(np.where(along > _UPRIGHT * across, along, 0.0), after[..., 1])
+            _growth(np.linalg.norm(before, axis=2), np.linalg.norm(after, axis=2))
+            + _growth(np.where(upright, before[..., 1], 0.0), after[..., 1])
         )
     log_size = np.concatenate(([0.0], np.cumsum(steps)))
     half = min(_SIZE_WINDOW, len(log_size)) // 2

@@ -37,8 +37,8 @@ the color of a single one doubles its odds at most."""
 _ROUNDS = 2
 _BLUR_PX = 1.0
 """Standard deviation of the Gaussian over what colors say, working px: that of the compression and of mixed pixels."""
-_STEPS = 24
-"""Evidence is held in steps of one over this, log odds: within the range of a signed byte."""
+_STEPS, _MOST = 24, 127
+"""Evidence is held in steps of one over this, log odds, and so many of them at most: a signed byte."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class NearRegion:
         size = evidence.shape[:2]
         small = cv2.resize(region.astype(np.uint8), size[::-1], interpolation=cv2.INTER_AREA)
         near = (cv2.dilate(small, disk(reach_px)) > 0) & pictured
-        held = np.clip(np.rint(evidence[near] * _STEPS), -127, 127).astype(np.int8)
-        return cls(size, np.packbits(near), _bins(image)[near], held)
+        held = np.clip(np.rint(evidence[near] * _STEPS), -_MOST, _MOST).astype(np.int8)
+        return cls(size, np.packbits(near), _bins(cv2.cvtColor(image, cv2.COLOR_RGB2LAB)[near]), held)
 
     @property
     def mask(self) -> BoolArray:
@@ -92,7 +92,7 @@ class NearRegion:
     def moving(self, odds: Float32Array) -> Float32Array:
         """Return the log odds (h, w) that pixels move; those that are not near do not."""
         mask, evidence = self.colored(odds)
-        out = np.full(self.size, np.float32(-127 / _STEPS))
+        out = np.full(self.size, np.float32(-_MOST / _STEPS))
         out[mask] = evidence
         return out
 
@@ -120,14 +120,13 @@ def color_odds(frames: Sequence[NearRegion], config: MotionMaskConfig) -> Float3
     return odds
 
 
-def _bins(image: ImageArray) -> npt.NDArray[np.uint16]:
-    """Return the bin (h, w) of each color of an image (h, w, 3) uint8 RGB."""
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+def _bins(lab: np.ndarray) -> npt.NDArray[np.uint16]:
+    """Return the bin (N,) of each color (N, 3) uint8 L*a*b*."""
     of_value = np.arange(256)
     lightness = (of_value * _BINS // 256).astype(np.uint16)
     # OpenCV has a* and b* of bytes shifted by 128.
     color = np.clip((of_value - 128 + _COLORFUL) * _BINS // (2 * _COLORFUL), 0, _BINS - 1).astype(np.uint16)
-    bins: npt.NDArray[np.uint16] = (lightness[lab[..., 0]] * _BINS + color[lab[..., 1]]) * _BINS + color[lab[..., 2]]
+    bins: npt.NDArray[np.uint16] = (lightness[lab[:, 0]] * _BINS + color[lab[:, 1]]) * _BINS + color[lab[:, 2]]
     return bins
 
 

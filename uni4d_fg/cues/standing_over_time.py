@@ -17,11 +17,14 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from uni4d_fg.arrays import BoolArray, FloatArray
+from uni4d_fg.cues.interpolated_depth import NEAREST_SHARE
 
 _WALK = 0.005
 """Standard deviation of a step from one frame to the next."""
-_NEARER, _FARTHER = 0.1, 0.3
-"""Mean of how much nearer than the thing a mask ends, and farther: three of four times it is farther."""
+_NEARER = 0.1
+"""Mean of how much nearer than the thing a mask ends, ..."""
+_FARTHER = _NEARER * NEAREST_SHARE / (1 - NEAREST_SHARE)
+"""... and farther: of a walk that does not walk that quantile is left."""
 _EXACT = 1e-3
 """What is seen so closely counts no more than this."""
 _ROUNDS, _STAYS = 100, 1e-5
@@ -34,7 +37,7 @@ def standing_over_time(log_inverse: FloatArray, is_bound: BoolArray) -> FloatArr
         log_inverse: (T,) where its masks end, the apparent size taken off.
         is_bound: (T,) the image cuts it off there, so that it is nearer by any factor; not in all frames.
     """
-    found = np.full(len(log_inverse), float(np.quantile(log_inverse[~is_bound], _FARTHER / (_FARTHER + _NEARER))))
+    found = np.full(len(log_inverse), float(np.quantile(log_inverse[~is_bound], NEAREST_SHARE)))
     if len(found) == 1:
         return found
     pull = _WALK**-2
