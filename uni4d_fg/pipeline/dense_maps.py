@@ -188,17 +188,18 @@ class DenseMaps:
             if not self._cue_is_poor:
                 self.bleeding_px = 0.0  # told by depth that is the worse one
 
-    def prepare(self, frames: list[int], mapped: OrderedMap) -> None:
+    def prepare(self, frames: list[int], mapped: OrderedMap, unfinished: int) -> None:
         """Make what :meth:`final` needs for frames that follow each other, and forget what only those before needed.
 
         Args:
             frames: The frames.
             mapped: The threads that may work on it.
+            unfinished: The first frame that :meth:`final` is still asked for, maybe on other threads meanwhile.
         """
         if self.config.static == "nearest_points":
             return
         reach = max(self.config.averaged_offsets, default=0)
-        self.made = {number: made for number, made in self.made.items() if number >= frames[0] - reach}
+        self.made = {number: made for number, made in self.made.items() if number >= unfinished - reach}
         near = {
             frame + sign * offset
             for frame in frames
@@ -208,7 +209,7 @@ class DenseMaps:
         wanted = sorted(number for number in near if 0 <= number < self.sequence.num_frames and number not in self.made)
         if not self.unmatched and wanted:
             # Frames that are matched share what they are matched with, and matching has threads of its own.
-            self.multiview.forget_before(wanted[0], frames[0])
+            self.multiview.forget_before(wanted[0], unfinished)
             self.measured |= {number: self.multiview.at(number) for number in wanted}
         # A broken frame takes its cue from others.
         for numbers in ([n for n in wanted if n not in self.broken], [n for n in wanted if n in self.broken]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 from uni4d_fg.arrays import Float32Array, ImageArray
@@ -12,7 +13,7 @@ from uni4d_fg.results.confidence_store import in_steps
 from uni4d_fg.results.fusion.told_error import ToldError
 
 _FRAMES_PER_THREAD = 2
-"""Threads wait for each other once per as many frames."""
+"""So many frames are finished while as many that follow them are prepared."""
 
 
 class FusedFrame(NamedTuple):
@@ -31,16 +32,23 @@ def fused_frames(maps: DenseMaps, first: int, stop: int) -> Iterator[FusedFrame]
     """Yield frames ``first`` to ``stop - 1``, in order, made on as many threads as ``maps`` has."""
     together = _FRAMES_PER_THREAD * maps.threads
     with workers_in_order(maps.threads) as mapped:
+        begun: Iterator[FusedFrame] = iter(())
+        unfinished = first
         for start in range(first, stop, together):
             frames = list(range(start, min(start + together, stop)))
-            maps.prepare(frames, mapped)
-            for frame, (depth, static) in zip(frames, mapped(maps.final, frames), strict=True):
-                told = ToldError(maps.is_interpolated)
-                if static is None:
-                    yield FusedFrame(frame, depth, None, told)
-                    continue
-                told.add(
-                    static.log_depth, static.confidence, static.still, *maps.landmarks_in(frame),
-                    common_sigma=maps.common_sigma(frame),
-                )  # fmt: skip
-                yield FusedFrame(frame, depth, in_steps(static.confidence), told)
+            maps.prepare(frames, mapped, unfinished)
+            before, begun, unfinished = begun, mapped(partial(_fused, maps), frames), start
+            yield from before
+        yield from begun
+
+
+def _fused(maps: DenseMaps, frame: int) -> FusedFrame:
+    depth, static = maps.final(frame)
+    told = ToldError(maps.is_interpolated)
+    if static is None:
+        return FusedFrame(frame, depth, None, told)
+    told.add(
+        static.log_depth, static.confidence, static.still, *maps.landmarks_in(frame),
+        common_sigma=maps.common_sigma(frame),
+    )  # fmt: skip
+    return FusedFrame(frame, depth, in_steps(static.confidence), told)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -123,16 +124,15 @@ class MultiviewDepth:
         return self._shown(frame).gray
 
     def forget_before(self, frame: int, finished: int) -> None:
-        """Forget what is not needed any more.
+        """Forget what is not needed any more; :meth:`edges_again` may run on other threads.
 
         Args:
             frame: The first one that is still to be matched.
             finished: All frames before this one are finished.
         """
         oldest = frame - max(self.config.compared_offsets, default=0)
-        self.raw = {number: kept for number, kept in self.raw.items() if number >= oldest}
-        oldest = min(oldest - self.farthest, finished - max(self.config.edge_offsets, default=0))
-        self.shown = {number: kept for number, kept in self.shown.items() if number >= oldest}
+        _forget(self.raw, oldest)
+        _forget(self.shown, min(oldest - self.farthest, finished - max(self.config.edge_offsets, default=0)))
 
     def _raw(self, frame: int) -> _Raw | None:
         if frame not in self.raw:
@@ -178,3 +178,10 @@ class MultiviewDepth:
             for number in (frame, *views)
         )
         return exposures(own, others, points)
+
+
+def _forget(kept: dict[int, Any], oldest: int) -> None:
+    """Remove what is kept of frames before the oldest that is needed."""
+    for number in list(kept):  # others may add to it
+        if number < oldest:
+            del kept[number]
