@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from functools import partial
 from typing import NamedTuple
 
 from uni4d_fg.arrays import Float32Array, ImageArray
-from uni4d_fg.optim.threads import workers_in_order
+from uni4d_fg.optim.threads import OrderedMap, made_ahead, workers_in_order
 from uni4d_fg.pipeline.dense_maps import DenseMaps
 from uni4d_fg.results.confidence_store import in_steps
 from uni4d_fg.results.fusion.told_error import ToldError
@@ -30,16 +30,18 @@ class FusedFrame(NamedTuple):
 
 def fused_frames(maps: DenseMaps, first: int, stop: int) -> Iterator[FusedFrame]:
     """Yield frames ``first`` to ``stop - 1``, in order, made on as many threads as ``maps`` has."""
-    together = _FRAMES_PER_THREAD * maps.threads
     with workers_in_order(maps.threads) as mapped:
-        begun: Iterator[FusedFrame] = iter(())
-        unfinished = first
-        for start in range(first, stop, together):
-            frames = list(range(start, min(start + together, stop)))
-            maps.prepare(frames, mapped, unfinished)
-            before, begun, unfinished = begun, mapped(partial(_fused, maps), frames), start
-            yield from before
-        yield from begun
+        for frames in made_ahead(_prepared(maps, first, stop, mapped), maps.threads, ahead=1):
+            yield from mapped(partial(_fused, maps), frames)
+
+
+def _prepared(maps: DenseMaps, first: int, stop: int, mapped: OrderedMap) -> Generator[list[int], None, None]:
+    """Yield frames that follow each other when they are prepared; those yielded last need not be finished by then."""
+    together = _FRAMES_PER_THREAD * maps.threads
+    for start in range(first, stop, together):
+        frames = list(range(start, min(start + together, stop)))
+        maps.prepare(frames, mapped, unfinished=max(first, start - together))
+        yield frames
 
 
 def _fused(maps: DenseMaps, frame: int) -> FusedFrame:
