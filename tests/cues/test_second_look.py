@@ -59,9 +59,9 @@ def test_a_plain_thing_differs_from_the_background_where_it_looks_as_if_it_stood
     inside = np.s_[50:70, 20 + STEP * frame + 16 : 20 + STEP * frame + SIDE - 16]
     beside = np.s_[50:70, 130:150]
     neighbors = NeighborComparison(given, CONFIG.model_copy(update={"track_weight": 0.0}))
-    of_neighbors = dict(enumerate(neighbors.evidence(never)))[frame].log_odds
+    of_neighbors = list(neighbors.of_frames(neighbors.evidence, never))[frame].log_odds
     background = BackgroundComparison(given, CONFIG.model_copy(update={"background_track_weight": 0.0}), first)
-    of_background = dict(enumerate(background.evidence(never)))[frame].log_odds
+    of_background = list(background.of_frames(background.evidence, never))[frame].log_odds
     assert of_neighbors[inside].mean() < 1
     assert of_background[inside].mean() > 3
     # Flat as it is, the wall is seen to be what it is elsewhere in time; its neighbors could not tell.
@@ -80,7 +80,8 @@ def test_where_no_frame_shows_the_background_the_first_look_has_its_say() -> Non
     half[:, :80] = 1
     everywhere = [np.packbits(half)] * FRAMES
     config = CONFIG.model_copy(update={"background_track_weight": 0.0, "background_margin_px": 0})
-    evidence, weight = dict(enumerate(BackgroundComparison(given, config, everywhere).evidence(never)))[15]
+    comparison = BackgroundComparison(given, config, everywhere)
+    evidence, weight = list(comparison.of_frames(comparison.evidence, never))[15]
     np.testing.assert_allclose(evidence[:, :75], config.threshold + 0.75)
     np.testing.assert_allclose(weight[:, :75], 0.3)
     assert evidence[10:30, 90:150].mean() < -2

@@ -9,8 +9,8 @@ the background they are the background, darker.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -53,11 +53,9 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
     """
 
     def __init__(self, given: ComparedVideo, config: MotionMaskConfig, first_look: list[np.ndarray]) -> None:
-        super().__init__(given, config)
+        super().__init__(given, config, config.background_baselines)
         self._first_look = first_look
         self._threshold = given.threshold(config)
-        self._source: FrameAppearance
-        self._texture: Float32Array
 
     def _moved_at_first(self, frame: int) -> npt.NDArray[np.uint8]:
         count = self.size[0] * self.size[1]
@@ -73,46 +71,34 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
         depth = depth_behind(self.depth(frame), np.asarray(around))
         return BackgroundFrame(image, depth, may_move, compared_frame(image, depth, *self.appearance_settings(frame)))
 
-    def begin(self, frame: int) -> None:
-        """Prepare the frame that is compared.
+    def evidence(self, frame: int) -> Evidence:
+        """Take the mean over the frames that show the background, and what the first look said where none does.
 
         The color before a background may be any: where the image is flat it differs as it would elsewhere.
         """
         given = self.frames[frame]
         source = frame_appearance(given.image, given.depth, *self.appearance_settings(frame))
-        self._texture = source.contrast
-        least = np.float32(3 * self.config.background_contrast**2)
-        self._source = replace(source, contrast=np.maximum(source.contrast, least))
-
-    def pairs(self, frame: int) -> list[tuple[int, int]]:
-        """Return both directions of all baselines."""
-        return [
-            (frame, other)
-            for step in self.config.background_baselines
-            for other in (frame - step, frame + step)
-            if 0 <= other < self.given.video.num_frames
-        ]
-
-    def pair(self, pair: tuple[int, int]) -> Float32Array:
-        """Compare a frame with what another shows of the background; NaN where it shows none."""
-        other = self.frames[pair[1]]
-        static = self.predicted(self._source.z, pair)
-        evidence = moved_evidence(self._source, other.compared, static, self.config, self._texture)
-        u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
-        covered = cv2.remap(
-            other.may_move.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(1,)
-        )
-        # What is outside of the other frame, or hidden in it, has no evidence at all.
-        return np.where((covered > 0) | (evidence == 0), np.float32(np.nan), evidence)
-
-    def combined(self, frame: int, said: Iterator[Float32Array]) -> Evidence:
-        """Take the mean over the frames that show the background, and what the first look said where none does."""
+        texture, least = source.contrast, np.float32(3 * self.config.background_contrast**2)
+        source = replace(source, contrast=np.maximum(texture, least))
         total, count = np.zeros(self.size, np.float32), np.zeros(self.size, np.float32)
-        for evidence in (next(said) for _ in self.pairs(frame)):
-            shown = np.isfinite(evidence)
-            total[shown] += evidence[shown]
+        for other in chain.from_iterable(self.others(frame)):
+            said = self._compared(source, texture, frame, other)
+            shown = np.isfinite(said)
+            total[shown] += said[shown]
             count += shown
         at_first = np.where(self._moved_at_first(frame) > 0, self._threshold + _AS_FIRST, self._threshold - _AS_FIRST)
         mean = np.where(count > 0, np.float32(_OF_ALL) * total / np.maximum(count, 1), at_first)
         log_odds = mean + np.float32(self.config.background_track_weight) * self.track_evidence(frame)
         return Evidence(log_odds.astype(np.float32), np.where(count > 0, 1, _ASSUMED).astype(np.float32))
+
+    def _compared(self, source: FrameAppearance, texture: Float32Array, frame: int, other: int) -> Float32Array:
+        """Compare a frame with what another shows of the background; NaN (h, w) where it shows none."""
+        target = self.frames[other]
+        static = self.predicted(source.z, (frame, other))
+        evidence = moved_evidence(source, target.compared, static, self.config, texture)
+        u, v = np.asarray(static.u, np.float32), np.asarray(static.v, np.float32)
+        covered = cv2.remap(
+            target.may_move.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(1,)
+        )
+        # What is outside of the other frame, or hidden in it, has no evidence at all.
+        return np.where((covered > 0) | (evidence == 0), np.float32(np.nan), evidence)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, NamedTuple, TypeVar
 
@@ -20,11 +20,15 @@ from uni4d_fg.cues.track_motion import QuadraticGrid, TrackMotion
 from uni4d_fg.errors import Cancelled
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
 from uni4d_fg.frontend.track_model import Tracks
-from uni4d_fg.optim.threads import OrderedMap, thread_count, workers_in_order
+from uni4d_fg.optim.threads import OrderedMap, made_ahead, thread_count, workers_in_order
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.stages.scene import Cameras
 
 PreparedT = TypeVar("PreparedT")
+ResultT = TypeVar("ResultT")
+
+_FRAMES_PER_THREAD = 1
+"""So many frames are compared while as many that follow them are prepared."""
 
 
 class Evidence(NamedTuple):
@@ -57,63 +61,61 @@ class ComparedVideo:
 
 
 class FrameComparison(ABC, Generic[PreparedT]):
-    """Compares every frame with some others. Those who inherit say with which, and what they look for."""
+    """Compares every frame with others before and after it. Those who inherit say what they look for.
 
-    def __init__(self, given: ComparedVideo, config: MotionMaskConfig) -> None:
-        self.given, self.config = given, config
+    Args:
+        given: The video.
+        config: Sigmas and sizes.
+        baselines: So many frames before and after.
+    """
+
+    def __init__(self, given: ComparedVideo, config: MotionMaskConfig, baselines: Sequence[int]) -> None:
+        self.given, self.config, self.baselines = given, config, baselines
         image_size = given.video.image_size
         self.size = shrunk_size(image_size, working_scale(image_size, config.working_size_px))
         self.scale = np.array([self.size[1] / image_size[1], self.size[0] / image_size[0]])
         self.pixels = PixelGrid.of(replace(given.camera, intrinsics=given.cameras.intrinsics), self.size, image_size)
         self.grid = QuadraticGrid.of(self.size, self.scale, image_size)
         self.frames: dict[int, PreparedT] = {}
+        """Those that are held."""
 
     @abstractmethod
     def prepared(self, frame: int) -> PreparedT:
-        """Prepare a frame. It is held for as long as others are compared with it."""
-
-    def begin(self, frame: int) -> None:
-        """Prepare what only the comparisons of this frame need."""
+        """Prepare a frame, on any thread. It is held for as long as others are compared with it."""
 
     @abstractmethod
-    def pairs(self, frame: int) -> list[tuple[int, int]]:
-        """Return the pairs of frames that tell what moves in a frame, which is the first of each."""
+    def evidence(self, frame: int) -> Evidence:
+        """Return the evidence that pixels of a frame move, at working size; on any thread, while it is held."""
 
-    @abstractmethod
-    def pair(self, pair: tuple[int, int]) -> Float32Array:
-        """Return what the second frame of a pair says of the pixels (h, w) of the first; on any thread."""
+    def others(self, frame: int) -> list[list[int]]:
+        """Return the frames that a frame is compared with, those of each baseline together; none where a video ends."""
+        count = self.given.video.num_frames
+        return [[f for f in (frame - step, frame + step) if 0 <= f < count] for step in self.baselines]
 
-    @abstractmethod
-    def combined(self, frame: int, said: Iterator[Float32Array]) -> Evidence:
-        """Return the evidence of a frame from what its pairs say, in their order."""
-
-    def evidence(self, stop: Callable[[], bool]) -> Generator[Evidence, None, None]:
-        """Yield the evidence that pixels of a frame move, at working size, frame by frame.
+    def of_frames(self, made: Callable[[int], ResultT], stop: Callable[[], bool]) -> Iterator[ResultT]:
+        """Yield what is made of each frame, in order, on all threads; frames and those they ask for are held then.
 
         Raises:
             Cancelled: If ``stop`` turned true.
         """
-        count = self.given.video.num_frames
-        with workers_in_order(thread_count()) as mapped:
-            said = self._compared(0, mapped)
-            for frame in range(count):
-                if stop():
-                    raise Cancelled("stopped while comparing frames for the motion masks")
-                found = self.combined(frame, said)
-                if frame + 1 < count:  # on the threads, while the caller finds regions
-                    said = self._compared(frame + 1, mapped)
-                yield found
+        threads = thread_count()
+        with workers_in_order(threads) as mapped:
+            for frames in made_ahead(self._held(_FRAMES_PER_THREAD * threads, mapped, stop), threads, ahead=1):
+                yield from mapped(made, frames)
 
-    def _compared(self, frame: int, mapped: OrderedMap) -> Iterator[Float32Array]:
-        """Begin to compare a frame with others; return what :meth:`pair` says of each."""
-        pairs = self.pairs(frame)
-        needed = {frame, *(f for pair in pairs for f in pair)}
-        for other in sorted(needed - self.frames.keys()):
-            self.frames[other] = self.prepared(other)
-        for old in [f for f in self.frames if f < min(needed) - 1]:  # the one before is still looked at
-            del self.frames[old]
-        self.begin(frame)
-        return mapped(self.pair, pairs)
+    def _held(self, together: int, mapped: OrderedMap, stop: Callable[[], bool]) -> Generator[list[int], None, None]:
+        """Yield frames that follow each other when all that they need is held, as it is for those yielded before."""
+        count, reach = self.given.video.num_frames, max(self.baselines)
+        for start in range(0, count, together):
+            if stop():
+                raise Cancelled("stopped while comparing frames for the motion masks")
+            frames = list(range(start, min(start + together, count)))
+            needed = set(frames).union(*(sides for frame in frames for sides in self.others(frame)))
+            missing = sorted(needed - self.frames.keys())
+            self.frames.update(zip(missing, mapped(self.prepared, missing), strict=True))
+            for old in [frame for frame in self.frames if frame < start - together - reach]:
+                del self.frames[old]
+            yield frames
 
     def predicted(self, z: Float32Array, pair: tuple[int, int]) -> StaticPrediction:
         """Return where a static scene has pixels of depth z (h, w), with what errors of the cameras add to that."""

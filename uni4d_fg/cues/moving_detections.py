@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,25 +24,26 @@ PackedMask = npt.NDArray[np.uint8]
 """A mask (h, w) at working size, packed by :func:`numpy.packbits`."""
 
 
-def first_look(
-    given: ComparedVideo, config: MotionMaskConfig, stop: Callable[[], bool]
-) -> Generator[PackedMask, None, None]:
+def first_look(given: ComparedVideo, config: MotionMaskConfig, stop: Callable[[], bool]) -> Iterator[PackedMask]:
     """Yield by and large what moves, frame by frame.
 
     Raises:
         Cancelled: If ``stop`` turned true.
     """
     comparison = NeighborComparison(given, config)
-    for frame, looked in enumerate(_looked_at(comparison, config.smoothing_px, stop)):
-        moves = _between_bars(_above_threshold(looked.evidence, given, config), given)
+
+    def moving(frame: int) -> PackedMask:
+        evidence = _looked_at(comparison, config.smoothing_px, frame).evidence
+        moves = _between_bars(_above_threshold(evidence, given, config), given)
         region = _trusted(moves, frame, given, config).any(axis=0)
-        small = cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST)
-        yield np.packbits(small)
+        return np.packbits(cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST))
+
+    return comparison.of_frames(moving, stop)
 
 
 def second_look(
     given: ComparedVideo, config: MotionMaskConfig, first: list[PackedMask], stop: Callable[[], bool]
-) -> Generator[NearRegion, None, None]:
+) -> Iterator[NearRegion]:
     """Yield the regions that move, and what is around them, frame by frame, from what the first look found in T frames.
 
     Raises:
@@ -50,8 +52,8 @@ def second_look(
     comparison = BackgroundComparison(given, config, first)
     pictured = _between_bars(np.ones(given.video.image_size, bool), given)
     pictured = cv2.resize(pictured.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST) > 0
-    looked = averaged_over_time(_looked_at(comparison, config.background_smoothing_px, stop), config)
-    for frame, (image, evidence, _) in enumerate(looked):
+    looked = comparison.of_frames(partial(_looked_at, comparison, config.background_smoothing_px), stop)
+    for frame, (image, evidence, _) in enumerate(averaged_over_time(looked, config)):
         region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
         yield NearRegion.of(region, image, evidence, config.color_reach_px, pictured)
 
@@ -67,14 +69,12 @@ def detections(
         yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
 
 
-def _looked_at(
-    comparison: NeighborComparison | BackgroundComparison, radius_px: float, stop: Callable[[], bool]
-) -> Generator[LookedAt, None, None]:
-    """Yield what a comparison says of each frame, shared among like colors within a radius, image px."""
-    for frame, (log_odds, weight) in enumerate(comparison.evidence(stop)):
-        image = comparison.frames[frame].image
-        radius = radius_px * float(comparison.scale[0])
-        yield LookedAt(image, smoothed_evidence(log_odds, image, radius, comparison.config), weight)
+def _looked_at(comparison: NeighborComparison | BackgroundComparison, radius_px: float, frame: int) -> LookedAt:
+    """Return what a comparison says of a frame, shared among like colors within a radius, image px; on any thread."""
+    log_odds, weight = comparison.evidence(frame)
+    image = comparison.frames[frame].image
+    radius = radius_px * float(comparison.scale[0])
+    return LookedAt(image, smoothed_evidence(log_odds, image, radius, comparison.config), weight)
 
 
 def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:

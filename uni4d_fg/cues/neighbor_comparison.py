@@ -5,16 +5,16 @@ Of the two directions in time the less suspicious one counts: what is hidden in 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from uni4d_fg.arrays import Float32Array, ImageArray
+from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.appearance import FrameAppearance, frame_appearance, moved_evidence, with_other_depth
 from uni4d_fg.cues.behind_moving import depth_behind
-from uni4d_fg.cues.frame_comparison import Evidence, FrameComparison
+from uni4d_fg.cues.frame_comparison import ComparedVideo, Evidence, FrameComparison
 from uni4d_fg.cues.moving_regions import disk
 
 
@@ -34,6 +34,9 @@ class NeighborFrame:
 class NeighborComparison(FrameComparison[NeighborFrame]):
     """Frames compared with those at ``config.baselines`` before and after."""
 
+    def __init__(self, given: ComparedVideo, config: MotionMaskConfig) -> None:
+        super().__init__(given, config, config.baselines)
+
     def prepared(self, frame: int) -> NeighborFrame:
         """Prepare image and depth, and depth of the scene around where most tracks move."""
         image, depth, settings = self.image(frame), self.depth(frame), self.appearance_settings(frame)
@@ -44,34 +47,20 @@ class NeighborComparison(FrameComparison[NeighborFrame]):
             behind = with_other_depth(appearance, depth_behind(depth, moving), *settings)
         return NeighborFrame(image, tracks, appearance, behind)
 
-    def _by_baseline(self, frame: int) -> list[list[tuple[int, int]]]:
-        return [
-            [(frame, f) for f in (frame - step, frame + step) if 0 <= f < self.given.video.num_frames]
-            for step in self.config.baselines
-        ]
-
-    def pairs(self, frame: int) -> list[tuple[int, int]]:
-        """Return both directions of all baselines."""
-        return [pair for sides in self._by_baseline(frame) for pair in sides]
-
-    def pair(self, pair: tuple[int, int]) -> Float32Array:
-        """Compare two frames; both hypotheses of what is still have their say, at every second baseline each."""
-        source, target = pair
-        one, other = self.frames[source], self.frames[target]
-        if self.config.baselines.index(abs(target - source)) % 2:
-            ours, theirs = one.appearance, other.appearance
-        else:
-            ours, theirs = one.behind, other.behind
-        return moved_evidence(ours, theirs.compared, self.predicted(ours.z, pair), self.config)
-
-    def combined(self, frame: int, said: Iterator[Float32Array]) -> Evidence:
+    def evidence(self, frame: int) -> Evidence:
         """Add up the baselines and what the tracks say."""
         total, count = np.zeros(self.size, np.float32), 0
-        for sides in self._by_baseline(frame):
+        for number, sides in enumerate(self.others(frame)):
             if sides:
-                total += np.minimum.reduce([next(said) for _ in sides])
+                total += np.minimum.reduce([self._compared(frame, other, bool(number % 2)) for other in sides])
                 count += 1
         if count:
-            total *= len(self.config.baselines) / count
+            total *= len(self.baselines) / count
         total += np.float32(self.config.track_weight) * self.frames[frame].tracks
         return Evidence(total, np.ones_like(total))
+
+    def _compared(self, frame: int, other: int, as_given: bool) -> Float32Array:
+        """Compare two frames; both hypotheses of what is still have their say, at every second baseline each."""
+        source, target = self.frames[frame], self.frames[other]
+        ours, theirs = (source.appearance, target.appearance) if as_given else (source.behind, target.behind)
+        return moved_evidence(ours, theirs.compared, self.predicted(ours.z, (frame, other)), self.config)
