@@ -225,7 +225,7 @@ def _mapped(plain: Fitted, judge: TrackJudge) -> list[Fitted]:
             for log_ratio in near:
                 plane = PlaneAtInfinity.across(posed, float(np.exp(log_ratio)), exchanges=exchanges)
                 if plane is not None:
-                    tried[log_ratio] = sketch.cost(_with_plane_at_infinity(plain, plane, sketch)), plane
+                    tried[log_ratio] = sketch.cost(_with_plane_at_infinity(plain, plane)), plane
             if not tried:
                 return None
             at = sorted(tried)
@@ -234,17 +234,17 @@ def _mapped(plain: Fitted, judge: TrackJudge) -> list[Fitted]:
         return tried[best][1]
 
     planes = best_of(_RATIOS, exchanges=False), best_of(_EXCHANGING_RATIOS, exchanges=True)
-    return [_with_plane_at_infinity(plain, plane, judge) for plane in planes if plane is not None]
+    return [judge.anew(_with_plane_at_infinity(plain, plane)) for plane in planes if plane is not None]
 
 
-def _with_plane_at_infinity(plain: Fitted, plane: PlaneAtInfinity, judge: TrackJudge) -> Fitted:
-    """Return the cameras that a projective map makes of one that does not zoom, with points triangulated anew."""
+def _with_plane_at_infinity(plain: Fitted, plane: PlaneAtInfinity) -> Fitted:
+    """Return the cameras that a projective map makes of one that does not zoom, with the points of before."""
     scene, frames = plain.scene, np.flatnonzero(plain.scene.registered)
     poses = scene.world_T_cam.copy()
     poses[frames], growth = plane.cameras(poses[frames])
     log_zoom = np.interp(np.arange(len(poses)), frames, np.log(growth))
     camera = CameraModel.of_log_zoom(plain.camera.intrinsics, log_zoom)
-    return judge.anew(Fitted(camera, replace(scene, world_T_cam=poses, intrinsics=camera.intrinsics.copy())))
+    return Fitted(camera, replace(scene, world_T_cam=poses, intrinsics=camera.intrinsics.copy()))
 
 
 def _log_zoom(fitted: Fitted) -> FloatArray:
