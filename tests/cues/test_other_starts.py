@@ -7,6 +7,7 @@ import pytest
 from cues.start_scenes import GUESS, SIZE, K, TrackedScene, observed, sideways, tracked
 
 from uni4d_fg.config.load import load_config
+from uni4d_fg.cues.structure import search
 from uni4d_fg.cues.structure.growing import GrowingScene
 from uni4d_fg.cues.structure.hypotheses import Competition, Hypothesis, at_sides
 from uni4d_fg.cues.structure.motion import structure_from_motion
@@ -90,6 +91,23 @@ def test_a_scene_that_many_tracks_do_not_agree_with_may_be_bent() -> None:
     assert moving > 0.95
 
 
+def test_a_start_from_the_sides_that_leads_to_the_same_path_is_not_grown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "_may_be_bent", lambda scene: True)
+    grown = []
+    grow = Search._grown_from
+
+    def spy(self: Search, start: Hypothesis, seen: Observations) -> GrowingScene:
+        grown.append(start.tracks)
+        return grow(self, start, seen)
+
+    monkeypatch.setattr(Search, "_grown_from", spy)
+    path, _, _, _ = solved(tracked(sideways(FRAMES), 2))
+    assert path < 0.002
+    assert "sides" not in grown
+    solved(seated(12))
+    assert grown[-1] == "sides"
+
+
 def test_cameras_that_were_found_before_are_taken_where_they_explain_more_sharply(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -136,9 +154,9 @@ def test_where_cameras_that_were_found_before_explain_as_much_as_any_start_nothi
     grown = []
     grow = Search._grown_from
 
-    def spy(search: Search, start: Hypothesis, seen: Observations) -> GrowingScene:
+    def spy(self: Search, start: Hypothesis, seen: Observations) -> GrowingScene:
         grown.append(start)
-        return grow(search, start, seen)
+        return grow(self, start, seen)
 
     monkeypatch.setattr(Search, "_grown_from", spy)
     path, turn, focal, _ = solved(scene)

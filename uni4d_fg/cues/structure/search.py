@@ -30,6 +30,7 @@ from uni4d_fg.cues.structure.selection import spread_tracks
 from uni4d_fg.cues.structure.self_calibration import focal_of_pairs
 from uni4d_fg.cues.structure.trimming import trim, trim_and_converge
 from uni4d_fg.errors import SolverError
+from uni4d_fg.geometry.alignment import align_trajectories
 from uni4d_fg.progress import Reporter, SilentReporter
 from uni4d_fg.slam.lens.camera_model import CameraModel
 from uni4d_fg.slam.lens.rolling_shutter import Readout
@@ -52,6 +53,9 @@ start that is not taken."""
 _SHARPER = 0.85
 """Part of a scene's sharpest errors that another one has, at most, for that to be taken: 0.48 and 0.82 where a scene is
 bent; 0.98 and more where both start alike."""
+_SAME_PATH = 0.05
+"""Part of the extent of a path by which another one departs from it, at which both end at the same scene: 0.02 at most
+where a start from the sides of the picture did, 0.25 at least where it led elsewhere."""
 _BLUNTER = 1.15
 """Times the sharpest errors of a scene with a pinhole that one with a lens has, at most: up to 1.03 where there is a
 lens, as ideal pixels are larger; 1.37 where people who sit in the picture asked for one."""
@@ -140,9 +144,10 @@ class Search:
         if not hypotheses or stands_still(_agreeing(hypotheses[0].scene, used), self.num_frames, settings):
             return None
         scene, hypotheses = self._grown_best(competition, hypotheses, used)
-        if not self.is_trial and _may_be_bent(scene) and (side := competition.at_sides()) is not None:
-            other = _if_sharper(lambda: self._grown_from(side, used), scene, used)
-            if other is not None:
+        if not self.is_trial and _may_be_bent(scene):
+            side = _if_solved(lambda: _start_beside(competition, scene))
+            other = None if side is None else _if_sharper(lambda: self._grown_from(side, used), scene, used)
+            if side is not None and other is not None:
                 scene, hypotheses = other, [competition.of_grown(other, side.pair)]
         return Grown(scene, hypotheses, used)
 
@@ -170,12 +175,9 @@ class Search:
 
     def _grown_from(self, start: Hypothesis, observations: Observations) -> GrowingScene:
         """Grow a start over all frames, with tracks that may be others than those of its trial, and trim it."""
-        of_some = start.tracks == "sides"
-        if of_some:
-            trim(start.scene)
         scene = start.scene.seeing(observations, self.config)
         scene.prior_intrinsics = self.prior_intrinsics
-        if of_some:
+        if start.tracks == "sides":
             trim(scene)
             scene.leave_out(scene.left_out | scene.seen_without_point(), scene.limit_px)
         return self._grown_to_the_end(scene)
@@ -284,6 +286,24 @@ class Search:
         rivals = rivals_of(grown.hypotheses, grown.scene.world_T_cam)
         focal = grown.scene.mean_focal
         return self.holding_rivals(FocalInterval(focal, focal), rivals).reach(focal) <= OPEN_FOCAL
+
+
+def _start_beside(competition: Competition, scene: GrowingScene) -> Hypothesis | None:
+    """Return the start from the sides of the picture, trimmed; None where it gives no scene, or has the path of this.
+
+    Raises:
+        Cancelled: If asked to stop.
+        SolverError: If it cannot be trimmed.
+    """
+    side = competition.at_sides()
+    if side is None:
+        return None
+    trim(side.scene)
+    posed = np.flatnonzero(side.scene.registered & scene.registered)
+    path, other = scene.world_T_cam[posed], side.scene.world_T_cam[posed]
+    apart = align_trajectories(other, path).apply(other[:, :3, 3]) - path[:, :3, 3]
+    is_same = np.linalg.norm(apart) < _SAME_PATH * np.linalg.norm(path[:, :3, 3] - path[:, :3, 3].mean(axis=0))
+    return None if is_same else side
 
 
 def _at_cameras(scene: GrowingScene, start: StartCameras) -> GrowingScene:
