@@ -79,7 +79,7 @@ def test_it_reaches_no_farther_than_said(rng: np.random.Generator) -> None:
         looked = looked_at(picture(body, rng), blurred(body), reach)
         region = (blurred(body) > 0.25).astype(np.uint8)
         near = cv2.dilate(region, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)) > 0
-        np.testing.assert_array_equal(looked.mask, near)
+        np.testing.assert_array_equal(looked.near.unpacked(), near)
         found = looked.moving(np.full(32**3, 4.0, np.float32))
         assert (found[~near] < -5).all()
         np.testing.assert_allclose(
@@ -105,7 +105,7 @@ def test_what_was_seen_for_sure_outweighs_colors_up_to_their_limit(rng: np.rando
         assert np.abs(odds).max() == pytest.approx(limit)
     none = color_odds([looked], CONFIG.model_copy(update={"color_limit": 0.0}))
     np.testing.assert_array_equal(none, 0)
-    np.testing.assert_allclose(looked.moving(none)[looked.mask], looked.evidence)
+    np.testing.assert_allclose(looked.moving(none)[looked.near.unpacked()], looked.evidence)
 
 
 def test_without_what_moves_or_what_stands_colors_say_nothing(rng: np.random.Generator) -> None:

@@ -9,6 +9,7 @@ from uni4d_fg.cues.background_comparison import BackgroundComparison
 from uni4d_fg.cues.frame_comparison import ComparedVideo
 from uni4d_fg.cues.moving_detections import detections, first_look, second_look
 from uni4d_fg.cues.neighbor_comparison import NeighborComparison
+from uni4d_fg.cues.packed_mask import PackedMask
 from uni4d_fg.cues.track_motion import TrackMotion
 from uni4d_fg.frontend.sequence.model import ArrayFrames, Video
 from uni4d_fg.frontend.track_model import Tracks
@@ -76,9 +77,9 @@ def test_a_plain_thing_differs_from_the_background_where_it_looks_as_if_it_stood
 
 def test_where_no_frame_shows_the_background_the_first_look_has_its_say() -> None:
     given, _ = plain_square()
-    half = np.zeros(SIZE, np.uint8)
-    half[:, :80] = 1
-    everywhere = [np.packbits(half)] * FRAMES
+    half = np.zeros(SIZE, bool)
+    half[:, :80] = True
+    everywhere = [PackedMask.of(half)] * FRAMES
     config = CONFIG.model_copy(update={"background_track_weight": 0.0, "background_margin_px": 0})
     comparison = BackgroundComparison(given, config, everywhere)
     evidence, weight = list(comparison.of_frames(comparison.evidence, never))[15]

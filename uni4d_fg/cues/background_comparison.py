@@ -14,7 +14,6 @@ from itertools import chain
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
@@ -22,6 +21,7 @@ from uni4d_fg.cues.appearance import ComparedFrame, FrameAppearance, compared_fr
 from uni4d_fg.cues.behind_moving import depth_behind
 from uni4d_fg.cues.frame_comparison import ComparedVideo, Evidence, FrameComparison
 from uni4d_fg.cues.moving_regions import disk
+from uni4d_fg.cues.packed_mask import PackedMask
 
 _AS_FIRST = 0.75
 """Log odds above the threshold, or below it, by what the first look said, where no frame shows the background."""
@@ -49,23 +49,19 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
     Args:
         given: The video.
         config: Baselines and weights.
-        first_look: T masks (h, w) at working size of what moves by and large, packed by :func:`numpy.packbits`.
+        first_look: T masks (h, w) at working size of what moves by and large.
     """
 
-    def __init__(self, given: ComparedVideo, config: MotionMaskConfig, first_look: list[np.ndarray]) -> None:
+    def __init__(self, given: ComparedVideo, config: MotionMaskConfig, first_look: list[PackedMask]) -> None:
         super().__init__(given, config, config.background_baselines)
         self._first_look = first_look
         self._threshold = given.threshold(config)
-
-    def _moved_at_first(self, frame: int) -> npt.NDArray[np.uint8]:
-        count = self.size[0] * self.size[1]
-        return np.unpackbits(self._first_look[frame], count=count).reshape(self.size)
 
     def prepared(self, frame: int) -> BackgroundFrame:
         """Prepare a frame to be compared with."""
         image = self.image(frame)
         margin = disk(self.config.background_margin_px)
-        may_move = np.asarray(cv2.dilate(self._moved_at_first(frame), margin) > 0)
+        may_move = np.asarray(cv2.dilate(self._first_look[frame].unpacked().astype(np.uint8), margin) > 0)
         # Depth of what moves reaches beyond what was found of it.
         around = cv2.dilate(may_move.astype(np.uint8), disk(self.config.behind_reach_px)) > 0
         depth = depth_behind(self.depth(frame), np.asarray(around))
@@ -86,7 +82,9 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
             shown = np.isfinite(said)
             total[shown] += said[shown]
             count += shown
-        at_first = np.where(self._moved_at_first(frame) > 0, self._threshold + _AS_FIRST, self._threshold - _AS_FIRST)
+        at_first = np.where(
+            self._first_look[frame].unpacked(), self._threshold + _AS_FIRST, self._threshold - _AS_FIRST
+        )
         mean = np.where(count > 0, np.float32(_OF_ALL) * total / np.maximum(count, 1), at_first)
         log_odds = mean + np.float32(self.config.background_track_weight) * self.track_evidence(frame)
         return Evidence(log_odds.astype(np.float32), np.where(count > 0, 1, _ASSUMED).astype(np.float32))

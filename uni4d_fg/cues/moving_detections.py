@@ -7,7 +7,6 @@ from functools import partial
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from uni4d_fg.arrays import BoolArray, Float32Array
 from uni4d_fg.config.motion_masks import MotionMaskConfig
@@ -17,11 +16,9 @@ from uni4d_fg.cues.evidence_over_time import LookedAt, averaged_over_time
 from uni4d_fg.cues.frame_comparison import ComparedVideo
 from uni4d_fg.cues.moving_regions import grown, moving_region, smoothed_evidence, trusted_components
 from uni4d_fg.cues.neighbor_comparison import NeighborComparison
+from uni4d_fg.cues.packed_mask import PackedMask
 from uni4d_fg.cues.region_colors import NearRegion, color_odds
 from uni4d_fg.frontend.sequence.bars import only_content
-
-PackedMask = npt.NDArray[np.uint8]
-"""A mask (h, w) at working size, packed by :func:`numpy.packbits`."""
 
 
 def first_look(given: ComparedVideo, config: MotionMaskConfig, stop: Callable[[], bool]) -> Iterator[PackedMask]:
@@ -34,9 +31,9 @@ def first_look(given: ComparedVideo, config: MotionMaskConfig, stop: Callable[[]
 
     def moving(frame: int) -> PackedMask:
         evidence = _looked_at(comparison, config.smoothing_px, frame).evidence
-        moves = _between_bars(_above_threshold(evidence, given, config), given)
-        region = _trusted(moves, frame, given, config).any(axis=0)
-        return np.packbits(cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST))
+        region = _regions(evidence, given.threshold(config), frame, given, config).any(axis=0)
+        small = cv2.resize(region.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST)
+        return PackedMask.of(small > 0)
 
     return comparison.of_frames(moving, stop)
 
@@ -54,8 +51,8 @@ def second_look(
     pictured = cv2.resize(pictured.astype(np.uint8), comparison.size[::-1], interpolation=cv2.INTER_NEAREST) > 0
     looked = comparison.of_frames(partial(_looked_at, comparison, config.background_smoothing_px), stop)
     for frame, (image, evidence, _) in enumerate(averaged_over_time(looked, config)):
-        region = np.asarray(_trusted(_above_threshold(evidence, given, config), frame, given, config).any(axis=0))
-        yield NearRegion.of(region, image, evidence, config.color_reach_px, pictured)
+        region = _regions(evidence, given.threshold(config), frame, given, config).any(axis=0)
+        yield NearRegion.of(np.asarray(region), image, evidence, config.color_reach_px, pictured)
 
 
 def detections(
@@ -64,8 +61,7 @@ def detections(
     """Yield what moves, frame by frame: where the second look found regions, by what was seen and by color."""
     odds = color_odds(second, config)
     for frame, looked in enumerate(second):
-        moves = moving_region(looked.moving(odds), given.video.image_size, config.threshold, config)
-        masks = grown(_trusted(_between_bars(moves, given), frame, given, config), config.grow_px)
+        masks = grown(_regions(looked.moving(odds), config.threshold, frame, given, config), config.grow_px)
         yield FrameDetections(masks, np.ones(len(masks), np.int32), np.ones(len(masks), np.float32))
 
 
@@ -77,15 +73,15 @@ def _looked_at(comparison: NeighborComparison | BackgroundComparison, radius_px:
     return LookedAt(image, smoothed_evidence(log_odds, image, radius, comparison.config), weight)
 
 
-def _above_threshold(smooth: Float32Array, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:
-    return moving_region(smooth, given.video.image_size, given.threshold(config), config)
+def _regions(
+    evidence: Float32Array, threshold: float, frame: int, given: ComparedVideo, config: MotionMaskConfig
+) -> BoolArray:
+    """Return the regions (N, H, W) where evidence (h, w) exceeds a threshold, between black bars, that are trusted."""
+    region = _between_bars(moving_region(evidence, given.video.image_size, threshold, config), given)
+    return trusted_components(region, given.tracks, given.motion, frame, config)
 
 
 def _between_bars(region: BoolArray, given: ComparedVideo) -> BoolArray:
     """Return what of a region (H, W) is no black bar: bars seem to move where the scene does."""
     content = given.video.content
     return region if content is None else only_content(region, content, 0)
-
-
-def _trusted(region: BoolArray, frame: int, given: ComparedVideo, config: MotionMaskConfig) -> BoolArray:
-    return trusted_components(region, given.tracks, given.motion, frame, config)

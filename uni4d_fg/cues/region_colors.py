@@ -24,6 +24,7 @@ from scipy.ndimage import gaussian_filter
 from uni4d_fg.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from uni4d_fg.config.motion_masks import MotionMaskConfig
 from uni4d_fg.cues.moving_regions import disk
+from uni4d_fg.cues.packed_mask import PackedMask
 
 _BINS = 32
 """Of lightness and of both axes of color (CIE L*a*b*)."""
@@ -45,10 +46,8 @@ _STEPS, _MOST = 24, 127
 class NearRegion:
     """What a frame shows in and around its regions: little enough that it is held of all frames."""
 
-    size: tuple[int, int]
-    """(h, w) working px."""
-    near: npt.NDArray[np.uint8]
-    """Which pixels that is, packed by :func:`numpy.packbits`."""
+    near: PackedMask
+    """Which pixels (h, w) at working size that is."""
     color: npt.NDArray[np.uint16]
     """(N,) bins of their colors ..."""
     held: npt.NDArray[np.int8]
@@ -71,12 +70,7 @@ class NearRegion:
         small = cv2.resize(region.astype(np.uint8), size[::-1], interpolation=cv2.INTER_AREA)
         near = (cv2.dilate(small, disk(reach_px)) > 0) & pictured
         held = np.clip(np.rint(evidence[near] * _STEPS), -_MOST, _MOST).astype(np.int8)
-        return cls(size, np.packbits(near), _bins(cv2.cvtColor(image, cv2.COLOR_RGB2LAB)[near]), held)
-
-    @property
-    def mask(self) -> BoolArray:
-        """Return which pixels (h, w) are near."""
-        return np.unpackbits(self.near, count=self.size[0] * self.size[1]).reshape(self.size) > 0
+        return cls(PackedMask.of(near), _bins(cv2.cvtColor(image, cv2.COLOR_RGB2LAB)[near]), held)
 
     @property
     def evidence(self) -> Float32Array:
@@ -85,14 +79,14 @@ class NearRegion:
 
     def colored(self, odds: Float32Array) -> tuple[BoolArray, Float32Array]:
         """Return which pixels (h, w) are near, and the log odds (N,) that they move by what was seen and by color."""
-        mask, said = self.mask, np.zeros(self.size, np.float32)
+        mask, said = self.near.unpacked(), np.zeros(self.near.size, np.float32)
         said[mask] = odds[self.color]
         return mask, self.evidence + cv2.GaussianBlur(said, (0, 0), _BLUR_PX)[mask]
 
     def moving(self, odds: Float32Array) -> Float32Array:
         """Return the log odds (h, w) that pixels move; those that are not near do not."""
         mask, evidence = self.colored(odds)
-        out = np.full(self.size, np.float32(-_MOST / _STEPS))
+        out = np.full(self.near.size, np.float32(-_MOST / _STEPS))
         out[mask] = evidence
         return out
 
