@@ -82,9 +82,7 @@ class BackgroundComparison(FrameComparison[BackgroundFrame]):
             shown = np.isfinite(said)
             total[shown] += said[shown]
             count += shown
-        at_first = np.where(
-            self._first_look[frame].unpacked(), self._threshold + _AS_FIRST, self._threshold - _AS_FIRST
-        )
+        at_first = self._threshold + np.where(self._first_look[frame].unpacked(), _AS_FIRST, -_AS_FIRST)
         mean = np.where(count > 0, np.float32(_OF_ALL) * total / np.maximum(count, 1), at_first)
         log_odds = mean + np.float32(self.config.background_track_weight) * self.track_evidence(frame)
         return Evidence(log_odds.astype(np.float32), np.where(count > 0, 1, _ASSUMED).astype(np.float32))
