@@ -17,7 +17,7 @@ from uni4d_fg.optim.threads import map_in_order, thread_count
 _Check = Callable[[Any, tuple[int, int], str], np.ndarray]
 _CHECKS: dict[str, _Check] = {"image": checked_image, "depth": floating_depth, "mask": checked_mask}
 
-ALGORITHM_VERSION = 30
+ALGORITHM_VERSION = 31
 """Part of every key; raised whenever a stage gives another result for the same input and configuration."""
 
 

@@ -110,7 +110,7 @@ def join(
     base = FRAME * num_frames + SHARED
     free = _free_columns(start, added)
     free[base - SHARED : base] = False
-    size = np.inf
+    size, slowest = np.inf, 0.0
     for _ in range(_MAX_STEPS if added is None else _MAX_STEPS_ADDED):
         gradient, matrices = np.zeros(len(free)), []
         for part in information:
@@ -128,10 +128,10 @@ def join(
         cameras = _moved(cameras, step[:base])
         if added is not None:
             added.move(step)
-        # Steps shrink by a factor that hardly changes: where it is small, the last one need not be made to be known.
-        size, before = float(np.abs(step).max()), size
-        expected = size * size / before if size < 0.1 * before < np.inf else np.inf
-        if min(size, expected) < _STEP_SIZE:
+        # Steps shrink by a factor that changes up to ten times: where the largest is small, the last need not be made.
+        before, size = size, float(np.abs(step).max())
+        slowest = max(slowest, size / before)
+        if size < _STEP_SIZE or (0.0 < slowest < 0.1 and size * slowest < _STEP_SIZE):
             break
     return Joined(cameras, information, intrinsics_covariance, added)
 
