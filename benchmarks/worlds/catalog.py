@@ -12,7 +12,7 @@ WORLDS: dict[str, Callable[[], World]] = {
     for make in (
         streets.street_walk, streets.dash, rooms.table_orbit, rooms.living_room, outdoors.park_dog, outdoors.drone,
         stages.dancers, crowds.stairs_portrait, stages.skate, crowds.market, revisited.selfie, revisited.follow,
-        revisited.runner, revisited.tripod, revisited.arc_car, revisited.big_dog, revisited.helix,
+        revisited.runner, revisited.tripod, revisited.arc_car, revisited.big_dog, revisited.helix, streets.scooter,
     )
 }  # fmt: skip
 """Functions that build them."""

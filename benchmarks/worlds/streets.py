@@ -25,8 +25,8 @@ def white_lines() -> Material:
     return Material(spots((0.62, 0.62, 0.6), (0.88, 0.88, 0.86), 62, 16), 1.5)
 
 
-def street_walk() -> World:
-    """Return a walk on a pavement between houses with mirroring panes, parked cars, lamps and three people."""
+def _street() -> list[Piece]:
+    """Return a street between houses with mirroring panes, parked cars and lamps; its pavement is at y = 0."""
     paving = bricks((0.5, 0.48, 0.45), (0.64, 0.61, 0.56), (0.28, 0.27, 0.25), 4, 8, 63, 0.5, 0.035, 0.06, 0.09)
     curb = Material(spots((0.45, 0.45, 0.44), (0.62, 0.62, 0.6), 64, 16), 1.0)
     red = Material(bricks((0.5, 0.2, 0.14), (0.64, 0.34, 0.22), (0.62, 0.58, 0.52), seed=65), 1.76, macro=0.05)
@@ -67,6 +67,12 @@ def street_walk() -> World:
         bush((-1.95, -0.55, 4.9), (0.28, 0.35, 0.28), 71, 900, 0.04),
         slab((0.5, 0.4, 0.5), (-1.95, -0.2, 4.9), curb),
     ]
+    return static
+
+
+def street_walk() -> World:
+    """Return a walk on the pavement of a street, with three people."""
+    static = _street()
     things = [
         walker(look(1), straight((-1.0, 9.6), (-1.05, 0.0)), 1.35),
         walker(look(2), straight((0.45, 15.5), (0.55, 0.0)), 1.2, 0.4),
@@ -80,6 +86,31 @@ def street_walk() -> World:
     return World(
         "street_walk", static, things, Unrest(11, step_hz=1.9).on(path), Light((0.55, -0.75, -0.35)), focal_px=690.0,
         fps=20.0, frames=60, exposure_s=1 / 90, seed=1, tags=("panes", "forward", "people"),
+    )  # fmt: skip
+
+
+def scooter() -> World:
+    """Return a ride on a scooter at 7 m/s behind a van that is as fast, past people on the pavement."""
+
+    def van_at(s: float) -> FloatArray:
+        on_pavement: FloatArray = straight((5.5, 9.0), (5.5, 100.0))(s)
+        return on_pavement + np.array([0.0, 0.12, 0.0])
+
+    things = [
+        driving((0.8, 0.8, 0.78), van_at, lambda t: 7.0 * t + 0.3 * np.sin(1.3 * t), 4, 4.9),
+        walker(look(1), straight((-0.6, 22.0), (-0.7, 0.0)), 1.35),
+        walker(look(4), straight((0.3, 9.0), (0.2, 40.0)), 1.1, 0.2),
+    ]
+
+    def path(time: float) -> FloatArray:
+        z = 7.0 * time
+        x = 5.1 + 0.25 * np.sin(0.9 * time)
+        return looking((x, -1.4, z), (x + 0.15 * np.cos(0.9 * time), -1.2, z + 14.0))
+
+    unrest = Unrest(22, sway_m=0.008, sway_deg=0.3, tremor_deg=0.08)
+    return World(
+        "scooter", _street(), things, unrest.on(path), Light((0.4, -0.8, -0.3)), focal_px=600.0, fps=20.0, frames=50,
+        exposure_s=1 / 200, seed=22, tags=("forward", "same speed", "people"),
     )  # fmt: skip
 
 

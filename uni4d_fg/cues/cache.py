@@ -25,7 +25,7 @@ from uni4d_fg.files import atomic_path, atomic_write_text, load_npy, load_npz, s
 from uni4d_fg.frontend.sequence.digest import add_array
 from uni4d_fg.frontend.sequence.frames import FileFrames
 
-CACHE_VERSION = 27
+CACHE_VERSION = 28
 """Part of every key; raised whenever a maker gives other cues for the same image, card and configuration."""
 
 

@@ -40,6 +40,7 @@ from uni4d_fg.cues.structure.motion import (
 from uni4d_fg.cues.structure.rotation_focal import focal_of_rotations
 from uni4d_fg.cues.structure.search import StartCameras
 from uni4d_fg.cues.structure.triangulation import inverse_depth_sigma
+from uni4d_fg.cues.through_ground import tracks_through
 from uni4d_fg.errors import DegenerateProblemError, InputError
 from uni4d_fg.frontend.sequence.calibration import unusual_focal
 from uni4d_fg.frontend.sequence.model import FrameSource, Video
@@ -186,11 +187,15 @@ def _with_maps(
     inverse = _inverse_depths(structure, ideal, settings)
     # Maps are those of the images.
     observations = replace(ideal, uv=structure.camera.real(ideal.uv, ideal.frame))
+    ground, through = _ground(structure, observations, inverse, tracks, video.image_size)
+    if through.any():
+        structure = replace(structure, moving=structure.moving | through[structure.track])
+        inverse[through[observations.track]] = np.nan
     sparse = np.full(tracks.visible.shape, np.nan, dtype=np.float32)
     known = np.isfinite(inverse)
     sparse[observations.track[known], observations.frame[known]] = 1.0 / inverse[known]
     frames = _points_per_frame(structure, observations, inverse, video, tracks.num_tracks, settings)
-    maps = InterpolatedDepths(frames, video.image_size, settings, ground=_ground(structure, observations, inverse))
+    maps = InterpolatedDepths(frames, video.image_size, settings, ground=ground)
     depths, said, doubts = _place(maps, video, tracks, structure, reporter, should_stop)
     triangulated = int(np.isfinite(structure.points.position[:, 0]).sum())
     fx, fy = structure.intrinsics[:2]
@@ -267,18 +272,29 @@ def _inverse_depths(structure: Structure, observations: Observations, config: Ge
     return out
 
 
-def _ground(structure: Structure, observations: Observations, inverse: FloatArray) -> Ground | None:
-    """Find the ground among what is triangulated well; ``inverse`` (N,) is that of every observation's point."""
+def _ground(
+    structure: Structure, observations: Observations, inverse: FloatArray, tracks: Tracks, image_size: tuple[int, int]
+) -> tuple[Ground | None, BoolArray]:
+    """Find the ground among what is triangulated well, and the tracks (K,) that it shows to move.
+
+    ``inverse`` (N,) is that of every observation's point.
+    """
     known = np.isfinite(inverse)
     row = np.searchsorted(structure.track, observations.track[known])
     nearest = np.full(len(structure.track), np.inf)
     np.minimum.at(nearest, row, 1.0 / inverse[known])
     fine = np.isfinite(nearest) & ~structure.moving
-    plane = find_ground(structure.points.position[fine], nearest[fine], structure.world_T_cam)
+    points = structure.points.position[fine]
+    plane = find_ground(points, nearest[fine], structure.world_T_cam)
     if plane is None:
-        return None
+        return None, np.zeros(tracks.num_tracks, dtype=bool)
     ground = Ground(plane, structure.world_T_cam, structure.camera)
-    return None if ground.seen_through(observations, inverse) else ground
+    on_it = points[plane.holds(points, nearest[fine])]
+    through = tracks_through(ground, on_it, structure, observations, tracks, image_size)
+    stands = ~through[observations.track]
+    if ground.seen_through(observations.select(stands), inverse[stands]):
+        return None, np.zeros_like(through)
+    return ground, through
 
 
 def _points_per_frame(

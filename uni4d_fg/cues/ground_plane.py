@@ -61,6 +61,10 @@ class Plane:
         down = -(rays @ (world_T_cam[:3, :3].T @ self.normal))
         return np.maximum(down, 0.0) / height
 
+    def holds(self, points: FloatArray, distance: FloatArray) -> BoolArray:
+        """Return which points (N, 3) lie on it, (N,); ``distance`` (N,) is that from the nearest camera."""
+        return _on(self, points, _NEAR * distance)
+
 
 @dataclass(frozen=True)
 class Ground:

@@ -35,6 +35,8 @@ _RIDGE = 1e-9
 """Part of the trace that makes a matrix safe to invert; rays with a smaller eigenvalue are parallel."""
 _FAR = 1e5
 """Points far away are so many times farther than the cameras are apart."""
+_HUBER = 3.0
+"""Standard deviations beyond which an observation of an inverse depth counts less."""
 _CONVERGED = 1e-5
 """A step below this part of the distance ends the refinement of a point."""
 
@@ -158,6 +160,61 @@ def directions_far_away(rays: RayBundle) -> FloatArray:
     distance = _FAR * max(float(np.linalg.norm(np.ptp(centers, axis=0))), NEAR_PLANE)
     result: FloatArray = centers.mean(axis=0) + distance * total / np.where(length > 0, length, np.nan)
     return result
+
+
+def directions_along(rays: RayBundle, which: IntArray) -> FloatArray:
+    """Return the directions (M, 3) of some rays (M,) in the world, of depth one in their cameras."""
+    in_camera = unproject(rays.intrinsics, rays.uv[which], np.ones(len(which)))
+    rotation = rays.world_T_cam[rays.frame[which], :3, :3]
+    return np.asarray((rotation @ in_camera[..., None])[..., 0])
+
+
+def inverse_depths_along(rays: RayBundle, reference: IntArray, sigma_px: float) -> tuple[FloatArray, FloatArray]:
+    """Return the inverse depth (M,) of each track along one of its rays, and its standard deviation (M,).
+
+    Other than a point, it is found of what is infinitely far away as well, where it is zero. The error of the reference
+    is fitted with it, as a shift that all frames share: they differ by small rotations.
+
+    Args:
+        rays: N.
+        reference: (M,) the ray of each track.
+        sigma_px: Noise of the tracks; of a track that fits worse, its own.
+    """
+    rotation = rays.world_T_cam[rays.frame, :3, :3].swapaxes(1, 2)
+    center = rays.world_T_cam[:, :3, 3]
+    start = directions_along(rays, reference)[rays.row]
+    start = (rotation @ start[..., None])[..., 0]
+    away = center[rays.frame[reference]][rays.row] - center[rays.frame]
+    away = (rotation @ away[..., None])[..., 0]
+    focal = rays.intrinsics[:2]
+    with np.errstate(divide="ignore"):
+        behind = np.where(away[:, 2] < 0, -start[:, 2] / away[:, 2], np.inf)
+    nearest = np.full(rays.count, np.inf)
+    np.minimum.at(nearest, rays.row, behind)
+
+    def total(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(rays.row, values, rays.count), np.float64)
+
+    def centered(values: FloatArray, weight: FloatArray) -> FloatArray:
+        mean = np.stack([total(weight * column) for column in values.T], axis=1) / total(weight)[:, None]
+        return np.asarray(values - mean[rays.row])
+
+    inverse, weight = np.zeros(rays.count), np.ones(len(rays.row))
+    squared, information = np.zeros((2, rays.count))
+    for _ in range(_STEPS):
+        # In units of the depth along the reference: finite at infinity, where only the direction counts.
+        x = start + inverse[rays.row, None] * away
+        g = 1.0 / np.maximum(x[:, 2], NEAR_PLANE)[:, None]
+        off = centered(rays.uv - focal * x[:, :2] * g, weight)
+        slope = centered(focal * (away[:, :2] - x[:, :2] * g * away[:, 2:]) * g, weight)
+        squared, information = total(weight * np.sum(off**2, axis=1)), total(weight * np.sum(slope**2, axis=1))
+        step = total(weight * np.sum(slope * off, axis=1)) / np.maximum(information, 1e-12)
+        # No farther than half the way to where one of the cameras would be.
+        inverse = np.minimum(inverse + step, 0.5 * (inverse + nearest))
+        weight = 1.0 / np.maximum(np.hypot(off[:, 0], off[:, 1]) / (_HUBER * sigma_px), 1.0)
+    freedom = np.maximum(2.0 * np.bincount(rays.row, minlength=rays.count) - 3.0, 1.0)
+    variance = np.maximum(squared / freedom, sigma_px**2)
+    return inverse, np.sqrt(variance / np.maximum(information, 1e-12))
 
 
 def sound(points: Points, max_error_px: float, min_angle_deg: float) -> BoolArray:
