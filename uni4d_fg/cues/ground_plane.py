@@ -81,6 +81,13 @@ class Ground:
         rays = unproject(self.camera.intrinsics, ideal, np.ones(len(uv)))
         return np.nan_to_num(self.plane.inverse_depth(rays, self.world_T_cam[frame]))
 
+    def at(self, observations: Observations) -> FloatArray:
+        """Return the inverse depth (N,) of the ground at observations, at real pixels; 0 where it is not seen."""
+        inverse = np.zeros(len(observations))
+        for frame, rows in enumerate(rows_by_group(observations.frame, len(self.world_T_cam))):
+            inverse[rows] = self.inverse_depth(observations.uv[rows], frame)
+        return inverse
+
     def seen_through(self, observations: Observations, inverse: FloatArray) -> bool:
         """Tell whether too much is farther than the plane, as a floor is that is seen beside a table.
 
@@ -88,12 +95,9 @@ class Ground:
             observations: N, at real pixels.
             inverse: (N,) inverse depth of their points, NaN where unknown.
         """
-        known = np.flatnonzero(np.isfinite(inverse))
-        farther = [
-            self.inverse_depth(observations.uv[known[rows]], frame) > _FARTHER * inverse[known[rows]]
-            for frame, rows in enumerate(rows_by_group(observations.frame[known], len(self.world_T_cam)))
-        ]
-        return float(np.concatenate(farther).mean()) > _SEEN_THROUGH
+        known = np.isfinite(inverse)
+        farther = self.at(observations.select(known)) > _FARTHER * inverse[known]
+        return float(farther.mean()) > _SEEN_THROUGH
 
 
 def find_ground(points: FloatArray, distance: FloatArray, world_T_cam: FloatArray) -> Plane | None:

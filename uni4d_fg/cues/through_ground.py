@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uni4d_fg.arrays import BoolArray, FloatArray, IntArray
+from uni4d_fg.arrays import BoolArray, FloatArray
 from uni4d_fg.cues.ground_plane import Ground
 from uni4d_fg.cues.structure.motion import Structure
 from uni4d_fg.cues.structure.triangulation import RayBundle, directions_along, inverse_depths_along
@@ -57,20 +57,17 @@ def tracks_through(
     observations = observations.select(structure.registered[observations.frame])
     track, row = observations.rows()
     first = np.searchsorted(row, np.arange(len(track)))
-    frame = observations.frame[first]
-    there = np.zeros(len(track))
-    for seen in np.unique(frame).tolist():
-        there[frame == seen] = ground.inverse_depth(observations.uv[first[frame == seen]], seen)
+    there = ground.at(observations.select(first))
     known = np.searchsorted(structure.track, track)
     seen_often = np.bincount(row, minlength=len(track)) >= _MIN_OBSERVATIONS
     judged = (there > 0) & seen_often & ~structure.moving[known]
     # Points that are found in front of the ground need no closer look.
-    depth = seen_from(structure.world_T_cam, frame, structure.points.position[known])[:, 2]
+    depth = seen_from(structure.world_T_cam, observations.frame[first], structure.points.position[known])[:, 2]
     with np.errstate(invalid="ignore"):
         beyond = judged & ~((depth > NEAR_PLANE) & (depth * there < _FARTHER))
-    beyond[beyond] = _surely_beyond(ground, observations, structure, beyond[row], there[beyond])
+    beyond[beyond] = _surely_beyond(ground, observations.select(beyond[row]), there[beyond], structure.sigma_px)
     closed = beyond.copy()
-    closed[beyond] = _closed(ground, observations, first[beyond], there[beyond], on_ground)
+    closed[beyond] = _closed(ground, observations.select(first[beyond]), there[beyond], on_ground)
     through, others, sure = np.zeros((3, tracks.num_tracks), dtype=bool)
     through[track[beyond]], others[track[judged & ~beyond]], sure[track[closed]] = True, True, True
     if np.count_nonzero(sure) >= _MIN_TRACKS:
@@ -80,43 +77,40 @@ def tracks_through(
     return through if np.count_nonzero(through & sure) >= _MIN_TRACKS else np.zeros_like(through)
 
 
-def _surely_beyond(
-    ground: Ground, observations: Observations, structure: Structure, which: BoolArray, there: FloatArray
-) -> BoolArray:
-    """Return which of M tracks, with observations ``which`` (N,), are farther than the ground is, at ``there`` (M,)."""
-    some = ground.camera.ideal_observations(observations.select(which))
-    track, row = some.rows()
-    rays = RayBundle(row, ground.world_T_cam, some.frame, some.uv, ground.camera.intrinsics, len(track))
-    first = np.searchsorted(row, np.arange(len(track)))
-    inverse, sigma = inverse_depths_along(rays, first, max(structure.sigma_px, _LEAST_PX))
+def _surely_beyond(ground: Ground, observations: Observations, there: FloatArray, sigma_px: float) -> BoolArray:
+    """Return which of M tracks are farther than the ground, at inverse depth ``there`` (M,), along their first rays."""
+    rays = _rays(ground, observations)
+    first = np.searchsorted(rays.row, np.arange(rays.count))
+    inverse, sigma = inverse_depths_along(rays, first, max(sigma_px, _LEAST_PX))
     surely = there - inverse > _SURELY * np.hypot(sigma, _GROUND_SIGMA * there)
     return np.asarray(surely & (there > _FARTHER * inverse))
 
 
-def _closed(
-    ground: Ground, observations: Observations, which: IntArray, there: FloatArray, on_ground: FloatArray
-) -> BoolArray:
+def _closed(ground: Ground, observations: Observations, there: FloatArray, on_ground: FloatArray) -> BoolArray:
     """Return around which places on the ground there are points of it, on both sides of the ray that meets it there.
 
     Args:
         ground: Of the frames of a video.
-        observations: At real pixels.
-        which: (N,) the observations whose rays meet it.
+        observations: N of different tracks, at real pixels, whose rays meet it.
         there: (N,) inverse depth at which they do.
         on_ground: (M, 3) points of it.
     """
-    closed = np.zeros(len(which), dtype=bool)
-    if len(on_ground) == 0 or len(which) == 0:
+    closed = np.zeros(len(there), dtype=bool)
+    if len(on_ground) == 0 or len(there) == 0:
         return closed
-    some = ground.camera.ideal_observations(observations.select(which))
-    rays = RayBundle(
-        np.arange(len(which)), ground.world_T_cam, some.frame, some.uv, ground.camera.intrinsics, len(which)
-    )
-    away = directions_along(rays, np.arange(len(which))) / there[:, None]
-    place = ground.world_T_cam[some.frame, :3, 3] + away
+    rays = _rays(ground, observations)
+    away = directions_along(rays, np.arange(rays.count)) / there[:, None]
+    place = ground.world_T_cam[rays.frame, :3, 3] + away
     across = np.cross(ground.plane.normal, away)
     reach = _AROUND * np.linalg.norm(away, axis=1)
     for n, near in enumerate(cKDTree(on_ground).query_ball_point(place, reach)):
         left = (on_ground[near] - place[n]) @ across[n] > 0
         closed[n] = len(near) >= _MIN_AROUND and bool(left.any()) and not left.all()
     return closed
+
+
+def _rays(ground: Ground, observations: Observations) -> RayBundle:
+    """Return the rays of observations at real pixels."""
+    ideal = ground.camera.ideal_observations(observations)
+    track, row = ideal.rows()
+    return RayBundle(row, ground.world_T_cam, ideal.frame, ideal.uv, ground.camera.intrinsics, len(track))
